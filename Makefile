@@ -1,0 +1,45 @@
+# Two commands on a fresh clone: `make demo` and `make test`. Each makes $(VENV) if need be.
+PYTHON ?= python3
+VENV ?= .venv
+BIN = $(VENV)/bin
+
+.PHONY: demo test lint types notebooks benchmarks clean
+
+demo: $(VENV)/installed
+	$(BIN)/python -m ehsvjax --out out
+
+test: $(VENV)/installed-test
+	$(BIN)/python -m pytest -n auto
+
+lint: $(VENV)/installed-develop
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/installed-develop
+	$(BIN)/mypy
+
+notebooks: $(VENV)/installed-develop
+	$(BIN)/python notebooks/run_all.py
+
+benchmarks: $(VENV)/installed-test
+	$(BIN)/python benchmarks/monte_carlo.py
+	$(BIN)/python benchmarks/wide_bounds.py
+
+$(VENV)/bin/python:
+	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'ehsvjax needs Python 3.11 or newer')"
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/installed: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	touch $@
+
+$(VENV)/installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[test]"
+	touch $@
+
+$(VENV)/installed-develop: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[develop]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) out build *.egg-info

@@ -1,0 +1,246 @@
+"""The result of an identification: parameters, how well they fit, and what can be asked of them next."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.models.model import Model
+from ehsvjax.record import Record
+from ehsvjax.simulate import simulate
+
+
+class Score(NamedTuple):
+    """How well outputs are reproduced, by name of the output.
+
+    Attributes:
+        rmse: root of the mean squared error, in the output's unit.
+        fit_percent: 100*(1 - ||y - ym|| / ||y - mean(y)||), MATLAB's fit: 100 is perfect, 0 no better than the mean.
+        cost: equation (9) of the paper, the integral of the squared error, in the output's unit squared times s.
+
+    """
+
+    rmse: dict[str, float]
+    fit_percent: dict[str, float]
+    cost: dict[str, float]
+
+
+class History(NamedTuple):
+    """What the search went through, generation by generation (`[generation]`, as many as were run).
+
+    Attributes:
+        best_cost: of the best so far: the sum of squared residuals in noise variances.
+        median_cost: of the generation; +inf where more than half of its simulations failed.
+        failed: share of the generation whose simulation failed.
+        spread: largest standard deviation over the unknowns of the better half, as a share of the bounds' interval.
+        best: name -> `[generation]`, the best parameters so far, SI.
+
+    """
+
+    best_cost: Float[np.ndarray, " generation"]
+    median_cost: Float[np.ndarray, " generation"]
+    failed: Float[np.ndarray, " generation"]
+    spread: Float[np.ndarray, " generation"]
+    best: dict[str, Float[np.ndarray, " generation"]]
+
+
+class Effort(NamedTuple):
+    """What was done for a fit.
+
+    Attributes:
+        population, generations: sizes of the search as it was run.
+        stopped_early: whether the stop test ended it.
+        simulations: by the search, one for each individual and generation.
+        refined: whether a gradient refinement followed.
+        iterations: steps of the refinement from the best start, of the last round of weighting.
+        starts: how many points were refined.
+        starts_agreeing: how many of them led to the same minimum.
+        converged: whether the refinement has, by its own test; without refinement, whether the search's stop test has.
+        remaining: noise variances by which another step would still lower the sum of squares, to first order.
+
+    """
+
+    population: int
+    generations: int
+    stopped_early: bool
+    simulations: int
+    refined: bool
+    iterations: int
+    starts: int
+    starts_agreeing: int
+    converged: bool
+    remaining: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model with the parameters that fit the records best. Made by `identify`.
+
+    Attributes:
+        model: the model, with the bounds and fixed values that were used.
+        records: the records that it was fitted to.
+        parameters: name -> value of the identified parameters, SI.
+        initial: for each record, name -> value of all initial conditions, SI.
+        noise_variance: name of the output -> variance by which its residuals were weighted, unit squared: given, or the
+            mean square of the residuals themselves.
+        history: of the search.
+        effort: what was done.
+        warnings: what a user should know before trusting the numbers; empty if nothing.
+        huber: residuals beyond this many standard deviations weigh linearly; None: all are squared.
+
+    """
+
+    model: Model
+    records: tuple[Record, ...]
+    parameters: dict[str, float]
+    initial: tuple[dict[str, float], ...]
+    noise_variance: dict[str, float]
+    history: History
+    effort: Effort
+    warnings: tuple[str, ...]
+    huber: float | None = None
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that were fitted."""
+        return tuple(self.noise_variance)
+
+    @property
+    def cost(self) -> float:
+        """Equation (9) of the paper, the integral of the squared error, over all records.
+
+        With one output in its unit squared times s; with several, each is divided by its noise variance, in s.
+        """
+        costs = self._score.cost
+        if len(costs) == 1:
+            return next(iter(costs.values()))
+        return sum(cost / self.noise_variance[name] for name, cost in costs.items())
+
+    @property
+    def rmse(self) -> dict[str, float]:
+        """Root of the mean squared error of each output over all records, in its unit."""
+        return self._score.rmse
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of each output over all records, MATLAB's 100*(1 - NRMSE) with the mean removed."""
+        return self._score.fit_percent
+
+    def simulate(
+        self, record: Record, initial: Mapping[str, float] | str = "estimate"
+    ) -> dict[str, Float[np.ndarray, " time"]]:
+        """Simulate the fitted model over a record's inputs.
+
+        Args:
+            record: one that was fitted, or a new one.
+            initial: for a record that was fitted, its own initial conditions; for a new one they are first
+                "estimate"d from its outputs with the parameters held, or taken as "nominal", or given by name.
+
+        Returns:
+            every output of the model by name, `[time]`, SI.
+
+        Raises:
+            ValueError: if the record lacks an input, or has no output to estimate initial conditions from.
+
+        """
+        return simulate(self.model, record, self.parameters, self._initial_of(record, initial))
+
+    def residuals(
+        self, record: Record | None = None, initial: Mapping[str, float] | str = "estimate"
+    ) -> dict[str, Float[np.ndarray, " time"]]:
+        """Measured minus simulated of each output that the record holds, `[time]`, SI; NaN for missing samples.
+
+        Args:
+            record: by default the first that was fitted.
+            initial: as for `simulate`.
+
+        """
+        record = self.records[0] if record is None else record
+        simulated = self.simulate(record, initial)
+        return {name: measured - simulated[name] for name, measured in record.outputs.items()}
+
+    def score(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> Score:
+        """Judge the prediction of one record, fitted or new; arguments as for `simulate`."""
+        return _score([record], [self.residuals(record, initial)])
+
+    @property
+    def _score(self) -> Score:
+        return _score(self.records, [self.residuals(record) for record in self.records])
+
+    def _initial_of(self, record: Record, initial) -> dict[str, float]:
+        nominal = {p.name: p.value for p in self.model.initial}
+        if not isinstance(initial, str):
+            return nominal | dict(initial)
+        if initial == "nominal":
+            return nominal
+        if initial != "estimate":
+            raise ValueError(f"expected initial 'estimate', 'nominal' or values by name, got {initial!r}")
+        for fitted, values in zip(self.records, self.initial, strict=True):
+            if fitted is record:
+                return values
+        from ehsvjax.identify import estimate_initial
+
+        return estimate_initial(self, record)
+
+    def plot(self, record: Record | None = None):
+        """Draw measured against simulated, the residual, and the cost by generation; returns the matplotlib figure.
+
+        Args:
+            record: by default the first that was fitted.
+
+        """
+        from ehsvjax.plots import plot_fit
+
+        return plot_fit(self, self.records[0] if record is None else record)
+
+    def __str__(self) -> str:
+        """Return a summary in lmfit's manner: statistics, parameters with units, warnings."""
+        from ehsvjax.summary import summary
+
+        return summary(self)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        from ehsvjax.summary import summary_html
+
+        return summary_html(self)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the fit, its records included, to one NPZ file without pickled content."""
+        from ehsvjax.storage import save_fit
+
+        save_fit(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike, model: Model | None = None) -> "Fit":
+        """Read a fit that `save` wrote.
+
+        Args:
+            path: the file.
+            model: needed for a model of your own, as equations are not stored; those of this package are made again.
+
+        Raises:
+            ValueError: if the file holds no fit, or the model does not have the stored parameters.
+
+        """
+        from ehsvjax.storage import load_fit
+
+        return load_fit(path, model)
+
+
+def _score(records: Sequence[Record], residuals: Sequence[Mapping[str, Float[np.ndarray, " time"]]]) -> Score:
+    """Return the score of each output over records; a missing sample counts for nothing."""
+    names = dict.fromkeys(name for record in records for name in record.outputs)
+    rmse, fit_percent, cost = {}, {}, {}
+    for name in names:
+        pairs = [(r, e[name]) for r, e in zip(records, residuals, strict=True) if name in r.outputs]
+        errors = np.concatenate([error for _, error in pairs])
+        about_mean = np.concatenate([r.outputs[name] - np.nanmean(r.outputs[name]) for r, _ in pairs])
+        rmse[name] = float(np.sqrt(np.nanmean(errors**2)))
+        fit_percent[name] = float(100.0 * (1.0 - np.sqrt(np.nansum(errors**2) / np.nansum(about_mean**2))))
+        cost[name] = float(sum(np.nansum(error**2) * r.sample_period for r, error in pairs))
+    return Score(rmse, fit_percent, cost)

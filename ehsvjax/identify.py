@@ -1,0 +1,306 @@
+"""The recipe: search by the genetic algorithm, refine the best few by gradient, return the fit."""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.tree_util import Partial
+from jaxtyping import Array, Float, Key
+
+from ehsvjax import genetic
+from ehsvjax.fit import Effort, Fit, History
+from ehsvjax.genetic import Operators
+from ehsvjax.models.model import Model
+from ehsvjax.population import Problem, cast, population_cost, residuals, to_unit, to_values
+from ehsvjax.record import Record
+from ehsvjax.refine import Refined
+from ehsvjax.refine import refine as refine_starts
+from ehsvjax.search import search
+from ehsvjax.unknowns import Initial, problem_of
+
+DEFAULT_OPERATORS = Operators()
+
+
+def identify(
+    model: Model,
+    records: Record | Sequence[Record],
+    *,
+    key: Key[Array, ""],
+    population: int = 100,
+    generations: int = 50,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    fixed: Mapping[str, float] | None = None,
+    initial: Initial = "estimate",
+    refine: bool = True,
+    noise_variance: Mapping[str, float] | None = None,
+    huber: float | None = None,
+    operators: Operators = DEFAULT_OPERATORS,
+    tolerance: float = 0.01,
+    starts: int = 4,
+    progress: bool = False,
+    checkpoint: str | os.PathLike | None = None,
+) -> Fit:
+    """Identify a model's parameters from measured records (sections 3 and 4 of the paper).
+
+    A genetic algorithm in float32 searches within the bounds; then the best few individuals are refined in float64
+    until the residual sum of squares is as good as at its minimum. Records of different length share the parameters and
+    keep their own initial conditions. Several outputs are weighted by their noise: first as guessed from the records'
+    third differences, in the refinement by the variance of their own residuals (maximum likelihood).
+
+    Args:
+        model: what to identify; its free parameters are the unknowns.
+        records: one or more, each with every input and at least one output of the model.
+        key: random key, `jax.random.key(0)`; the same key gives the same fit.
+        population: individuals of a generation, at least 4.
+        generations: at most this many; population x generations individuals are simulated.
+        bounds: name -> (lower, upper), SI; frees a constant that is fixed by default.
+        fixed: name -> value, SI, for parameters that are not to be identified.
+        initial: "estimate" the initial conditions of each record, take the model's "nominal" ones, or give those that
+            are known by name (the others are estimated), one mapping for all records or one for each.
+        refine: whether the gradient refinement follows the search.
+        noise_variance: name of the output -> variance, unit squared, where it is known.
+        huber: residuals beyond this many standard deviations weigh linearly (1.345 is usual), for records with spikes.
+        operators: the genetic operators.
+        tolerance: the search stops before the last generation once a quarter of the population lies within this many
+            noise variances of the best; 0 never stops.
+        starts: how many of the best individuals that lie apart are refined.
+        progress: show a bar over generations.
+        checkpoint: file written after every generation, from which a killed run goes on to the same result.
+
+    Returns:
+        the fit: print it, plot it, simulate with it.
+
+    Raises:
+        ValueError: for anything that cannot be meant, before a simulation is run.
+
+    """
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    _check_call(records, key, starts, tolerance)
+    model = model.with_bounds(bounds, fixed)
+    problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
+
+    found, history = search(
+        Partial(population_cost, cast(problem, jnp.float32)),
+        key,
+        unknowns=problem.unknowns,
+        population=population,
+        generations=generations,
+        operators=operators,
+        tolerance=tolerance,
+        progress=progress,
+        checkpoint=checkpoint,
+    )
+    effort = _search_effort(found, generations)
+    individual = np.asarray(found.elites[0], np.float64)
+    if refine:
+        candidates = _candidates(problem, model, found, starts)
+        refined, problem = _refine_and_reweigh(problem, candidates, reweigh=noise_variance is None)
+        individual, effort = _best_of(refined, effort)
+    elif noise_variance is None:
+        problem = replace(problem, noise_variance=_residual_variance(problem, individual))
+    return _fit(model, records, problem, individual, history, effort)
+
+
+_to_values, _to_unit, _residuals = jax.jit(to_values), jax.jit(to_unit), jax.jit(residuals)
+
+
+def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
+    """Return the initial conditions that fit a new record best, name -> value, with the fit's parameters held.
+
+    Raises:
+        ValueError: if the record has no output to estimate them from.
+
+    """
+    if not fit.model.initial:
+        return {}
+    if not record.outputs:
+        raise ValueError(
+            f"expected {record.name} to hold an output to estimate its initial conditions from, got none: pass "
+            'initial="nominal" or their values by name'
+        )
+    known = replace(fit.model, parameters=tuple(p._replace(fixed=True) for p in fit.model.parameters))
+    known = known.with_bounds(fixed=fit.parameters)
+    variance = {name: v for name, v in fit.noise_variance.items() if name in record.outputs}
+    problem = problem_of(known, [record], noise_variance=variance, huber=fit.huber)
+    middle = np.full(problem.unknowns, 0.5)
+    starts = np.stack([middle, _with_nominal_initial(problem, known, middle)])
+    refined, problem = _refine_and_reweigh(problem, starts, reweigh=False)
+    best = refined.individual[int(np.argmin(refined.cost))]
+    return _initial_by_record(known, problem, best)[0]
+
+
+def _check_call(records, key, starts, tolerance):
+    if not records or not all(isinstance(record, Record) for record in records):
+        kinds = ", ".join(sorted({type(r).__name__ for r in records})) or "none"
+        raise ValueError(f"expected a Record or a sequence of Records, got {kinds}: make one with Record.from_csv")
+    if not (isinstance(key, jax.Array) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.shape == (2,))):
+        raise ValueError(f"expected key to be a random key such as jax.random.key(0), got {key!r}")
+    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
+        raise ValueError(f"expected starts to be a whole number of at least 1, got {starts!r}")
+    if not tolerance >= 0:
+        raise ValueError(f"expected tolerance to be zero or more noise variances, got {tolerance!r}")
+
+
+def _search_effort(found: genetic.State, generations: int) -> Effort:
+    done = int(found.generation)
+    return Effort(
+        population=len(found.population),
+        generations=done,
+        stopped_early=done < generations,
+        simulations=len(found.population) * done,
+        refined=False,
+        iterations=0,
+        starts=0,
+        starts_agreeing=0,
+        converged=bool(found.converged),
+        remaining=float("nan"),
+    )
+
+
+def _candidates(
+    problem: Problem, model: Model, found: genetic.State, starts: int
+) -> Float[np.ndarray, "individual parameter"]:
+    """Return where to refine from: the best few that lie apart, and the best with nominal initial conditions.
+
+    The last is there because a record may hardly show its initial conditions: the search leaves them anywhere, and the
+    way from there can be long.
+    """
+    population = np.asarray(found.population, np.float64)
+    best = population[
+        genetic.best_distinct(population[:, : len(problem.free)], np.asarray(found.cost), starts, distance=0.02)
+    ]
+    if not problem.free_initial:
+        return best
+    return np.vstack([best, _with_nominal_initial(problem, model, best[0])])
+
+
+def _with_nominal_initial(problem: Problem, model: Model, individual) -> Float[np.ndarray, " parameter"]:
+    """Return the individual with the initial conditions nominal, or in the middle where an output shows them."""
+    values = np.asarray(_values(problem, individual))
+    nominal = np.array(
+        [np.nan if model.parameter(name).output in problem.observed else model.parameter(name).value
+         for name in problem.free_initial]
+    )  # fmt: skip
+    count = len(problem.free)
+    values[count:] = np.tile(nominal, len(problem.samples.inputs))
+    with jax.enable_x64(True):
+        unit = np.asarray(_to_unit(problem.coordinates, values))
+    changed = np.array(individual, float)
+    changed[count:] = np.where(np.isnan(unit[count:]), 0.5, np.clip(unit[count:], 0.0, 1.0))
+    return changed
+
+
+def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refined, Problem]:
+    """Refine; then, while the weights of the outputs still change, weigh them by their residuals and refine again.
+
+    With one output and squared residuals the weight does not move the minimum, and one round is enough.
+    """
+    with jax.enable_x64(True):
+        refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64)))
+        if not reweigh:
+            return refined, problem
+        several = len(problem.observed) > 1 or problem.huber is not None
+        for _ in range(10 if several else 1):
+            best = refined.individual[np.argmin(refined.cost)]
+            variance = _residual_variance(problem, best)
+            settled = np.allclose(variance, problem.noise_variance, rtol=0.01)
+            problem = replace(problem, noise_variance=variance)
+            if settled or not several:
+                break
+            refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(refined.individual)))
+        return refined, problem
+
+
+def _in_numpy(refined: Refined) -> Refined:
+    return jax.tree.map(np.array, refined)
+
+
+def _residual_variance(problem: Problem, individual) -> Float[np.ndarray, " signal"]:
+    """Return the mean square of each output's residuals; with a Huber cost from their median size, robust to spikes."""
+    with jax.enable_x64(True):
+        standardised = np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
+    variances = []
+    for i, variance in enumerate(problem.noise_variance):
+        measured = standardised[..., i][problem.samples.measured[..., i]]
+        if problem.huber is None:
+            relative = np.mean(measured**2)
+        else:
+            relative = (np.median(np.abs(measured)) / 0.6744897501960817) ** 2
+        # A fit without any residual (data without noise) leaves the weight as it was.
+        variances.append(variance * relative if np.isfinite(relative) and relative > 0 else variance)
+    return np.array(variances)
+
+
+def _best_of(refined: Refined, effort: Effort) -> tuple[Float[np.ndarray, " parameter"], Effort]:
+    best = int(np.argmin(refined.cost))
+    return np.asarray(refined.individual[best]), effort._replace(
+        refined=True,
+        iterations=int(refined.iterations[best]),
+        starts=len(refined.cost),
+        starts_agreeing=int(np.sum(refined.cost <= refined.cost[best] * (1 + 1e-4))),
+        converged=bool(refined.converged[best]),
+        remaining=float(refined.remaining[best]),
+    )
+
+
+def _fit(model, records, problem: Problem, individual, history: genetic.History, effort: Effort) -> Fit:
+    values = _values(problem, individual)
+    parameters = {name: float(v) for name, v in zip(problem.free, values, strict=False)}
+    return Fit(
+        model=model,
+        records=records,
+        parameters=parameters,
+        initial=tuple(_initial_by_record(model, problem, individual)),
+        noise_variance={name: float(v) for name, v in zip(problem.observed, problem.noise_variance, strict=True)},
+        history=_history_in_units(problem, history, effort.generations),
+        effort=effort,
+        warnings=_warnings(model, problem, individual, effort),
+        huber=problem.huber,
+    )
+
+
+def _values(problem: Problem, individual) -> Float[np.ndarray, " *batch parameter"]:
+    with jax.enable_x64(True):
+        return np.array(_to_values(problem.coordinates, np.asarray(individual, np.float64)))
+
+
+def _initial_by_record(model: Model, problem: Problem, individual) -> list[dict[str, float]]:
+    count = len(problem.samples.inputs)
+    estimated = _values(problem, individual)[len(problem.free) :].reshape(count, len(problem.free_initial))
+    by_name = dict(zip(problem.free_initial, estimated.T, strict=True)) | problem.known_initial
+    return [{p.name: float(by_name[p.name][i]) for p in model.initial} for i in range(count)]
+
+
+def _history_in_units(problem: Problem, history: genetic.History, generations: int) -> History:
+    best_cost, median_cost, failed, spread, best = (np.asarray(leaf, np.float64)[:generations] for leaf in history)
+    values = _values(problem, best)
+    by_name = {name: values[:, i] for i, name in enumerate(problem.free)}
+    return History(best_cost, median_cost, failed, spread, by_name)
+
+
+def _warnings(model: Model, problem: Problem, individual, effort: Effort) -> tuple[str, ...]:
+    """Return what a user should know before trusting the numbers, each with what to do."""
+    found = []
+    names = [*problem.free, *(n for _ in range(len(problem.samples.inputs)) for n in problem.free_initial)]
+    for name, place in zip(names, individual, strict=True):
+        if min(place, 1.0 - place) < 1e-6:
+            side = "lower" if place < 0.5 else "upper"
+            what = "" if name in problem.free else " (an initial condition, which this record may hardly show)"
+            found.append(f"{name} is at its {side} bound{what}: widen bounds={{{name!r}: ...}} or fix it")
+    if not effort.refined:
+        found.append("not refined: the parameters are as good as the search left them; use refine=True")
+    elif not effort.converged:
+        found.append(
+            "the refinement has not converged: a further step would lower the sum of squares by "
+            f"{effort.remaining:.2g} noise variances; perhaps the record does not fix every parameter"
+        )
+    if effort.refined and effort.starts > 1 and effort.starts_agreeing == 1:
+        found.append(
+            f"only one of {effort.starts} starts led to this minimum, there may be a better one: use a larger "
+            "population or more generations"
+        )
+    del model
+    return tuple(found)

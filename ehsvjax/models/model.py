@@ -1,0 +1,214 @@
+"""What a model is: parameters, named signals, and the equations of one individual over one step.
+
+A model is a block diagram written for one individual. Its equations are three plain functions that take the values
+of all parameters as a dict `name -> scalar`:
+
+    start(parameters, initial, inputs) -> state                    the state at the first sample
+    stepper(parameters, step_size, signal) -> step                 step(state, inputs) -> state, one step later
+    measure(parameters, state, inputs, signal) -> outputs          dict of every output, at the sample itself
+
+`stepper` is called once per individual, outside the time loop: what does not change from step to step is computed
+there. In `step`, `inputs(fraction)` gives the inputs at that fraction of the step, as a dict. Every line of the
+diagram that physics could disturb passes through `signal(name, value, **context)`, the identity of the nominal model.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+Kind = Literal["input", "displacement", "pressure", "flow", "force", "sensor"]
+State = Any
+Inputs = Callable[[float], dict[str, Any]]
+
+
+class Parameter(NamedTuple):
+    """One number of a model: an unknown with bounds, or a constant (`fixed=True`).
+
+    `value` is the nominal value, used where the parameter is fixed; `scale` says in which coordinate the search moves:
+    "log" for positive quantities known by their order of magnitude. For an initial condition, `output` names the output
+    whose first samples tell about where it lies, if that output is measured.
+    """
+
+    name: str
+    symbol: str
+    unit: str
+    value: float
+    lower: float
+    upper: float
+    scale: Literal["linear", "log"] = "linear"
+    fixed: bool = False
+    output: str | None = None
+
+
+class Signal(NamedTuple):
+    """A named line of the block diagram, with its kind and its unit.
+
+    Lines of kind "input" are the model's inputs, lines of kind "sensor" its outputs.
+    """
+
+    name: str
+    kind: Kind
+    unit: str
+
+
+class Equations(NamedTuple):
+    """The part of a model that is traced: compiled once for all values, bounds and records."""
+
+    start: Callable[..., State]
+    stepper: Callable[..., Callable[[State, Inputs], State]]
+    measure: Callable[..., dict[str, Any]]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Model:
+    """A model to identify: `servovalve()`, `van_der_pol()`, or one that you wrote.
+
+    Attributes:
+        name: what it is called in prints and plots.
+        parameters: the unknowns and the constants.
+        initial: the unknown initial conditions, one set for each record.
+        signals: the named lines of the diagram; the inputs and outputs among them.
+        start, stepper, measure: the equations, see the module's docstring. Use module-level functions, or cached
+            factories of them: the same function object is compiled once.
+        max_step: longest integration step, s; a sample is divided into as many equal steps as this needs.
+        options: how the model was made, for prints and for `Fit.save`.
+
+    Raises:
+        ValueError: for names that repeat, bounds that are not in order, a value outside its bounds, a log scale with a
+            bound that is not positive, or a model without an output.
+
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    initial: tuple[Parameter, ...]
+    signals: tuple[Signal, ...]
+    start: Callable[..., State]
+    stepper: Callable[..., Callable[[State, Inputs], State]]
+    measure: Callable[..., dict[str, Any]]
+    max_step: float
+    options: tuple[tuple[str, Any], ...] = ()
+
+    def __post_init__(self):
+        """Refuse what cannot be a model."""
+        names = [p.name for p in (*self.parameters, *self.initial)]
+        signals = [s.name for s in self.signals]
+        for kind, found in (("parameter", names), ("signal", signals)):
+            repeated = {n for n in found if found.count(n) > 1}
+            if repeated:
+                raise ValueError(f"expected every {kind} of {self.name} to have its own name, got {repeated} twice")
+        for parameter in (*self.parameters, *self.initial):
+            check_bounds(parameter)
+        if not self.outputs:
+            raise ValueError(f"expected {self.name} to have an output, got no signal of kind 'sensor'")
+        if not self.max_step > 0:
+            raise ValueError(f"expected max_step of {self.name} to be positive seconds, got {self.max_step}")
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return tuple(s.name for s in self.signals if s.kind == "input")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs that can be measured."""
+        return tuple(s.name for s in self.signals if s.kind == "sensor")
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that are identified unless fixed."""
+        return tuple(p.name for p in self.parameters if not p.fixed)
+
+    @property
+    def nominal(self) -> dict[str, float]:
+        """Nominal value of every parameter and constant, SI."""
+        return {p.name: p.value for p in self.parameters}
+
+    @property
+    def equations(self) -> Equations:
+        """What is traced and compiled."""
+        return Equations(self.start, self.stepper, self.measure, self.inputs, self.outputs)
+
+    def parameter(self, name: str) -> Parameter:
+        """Return the parameter, constant or initial condition of that name.
+
+        Raises:
+            ValueError: if the model has none of that name; lists those that it has.
+
+        """
+        everything = (*self.parameters, *self.initial)
+        for parameter in everything:
+            if parameter.name == name:
+                return parameter
+        known = ", ".join(p.name for p in everything)
+        raise ValueError(f"expected a parameter of {self.name}, got {name!r}; it has {known}")
+
+    def unit(self, signal: str) -> str:
+        """Unit of the signal of that name."""
+        return next(s.unit for s in self.signals if s.name == signal)
+
+    def with_bounds(
+        self,
+        bounds: Mapping[str, tuple[float, float]] | None = None,
+        fixed: Mapping[str, float] | None = None,
+    ) -> "Model":
+        """Return the model with other bounds (which frees a constant) and with parameters fixed at values.
+
+        Raises:
+            ValueError: for an unknown name, a name in both, or bounds out of order.
+
+        """
+        bounds, fixed = dict(bounds or {}), dict(fixed or {})
+        for name in (*bounds, *fixed):
+            self.parameter(name)
+        both = sorted(set(bounds) & set(fixed))
+        if both:
+            raise ValueError(f"expected each parameter to be either bounded or fixed, got both for {', '.join(both)}")
+
+        def changed(p: Parameter) -> Parameter:
+            if p.name in bounds:
+                lower, upper = (float(b) for b in bounds[p.name])
+                value = min(max(p.value, lower), upper)
+                # A search over both signs cannot be logarithmic.
+                scale = p.scale if lower > 0 else "linear"
+                return p._replace(lower=lower, upper=upper, value=value, fixed=False, scale=scale)
+            if p.name in fixed:
+                return p._replace(value=float(fixed[p.name]), fixed=True)
+            return p
+
+        return replace(
+            self,
+            parameters=tuple(changed(p) for p in self.parameters),
+            initial=tuple(changed(p) for p in self.initial),
+        )
+
+
+def check_bounds(parameter: Parameter) -> None:
+    """Refuse bounds out of order, a value outside them, and a log scale that reaches zero.
+
+    Raises:
+        ValueError: with the parameter's name, what came, and what to do.
+
+    """
+    name, value, lower, upper = parameter.name, parameter.value, parameter.lower, parameter.upper
+    if not abs(value) < float("inf"):
+        raise ValueError(f"expected a finite value for {name}, got {value}")
+    if parameter.fixed:
+        return
+    if not (abs(lower) < float("inf") and abs(upper) < float("inf") and lower < upper):
+        raise ValueError(
+            f"expected finite bounds of {name} with lower < upper, got ({lower}, {upper}); to hold it at one value "
+            f"use fixed={{{name!r}: value}}"
+        )
+    if parameter.scale == "log" and lower <= 0:
+        raise ValueError(f"expected a positive lower bound of {name}, which is searched by its logarithm, got {lower}")
+    if not lower <= value <= upper:
+        raise ValueError(f"expected the value of {name} inside its bounds ({lower}, {upper}), got {value}")
+
+
+def identity(name: str, value: Any, **context: Any) -> Any:
+    """Pass a signal through unchanged: every line of a nominal model."""
+    del name, context
+    return value

@@ -1,0 +1,264 @@
+"""The whole population at once: the only room that vmaps the simulation.
+
+A `Problem` is everything that a simulation needs but the candidates: the records, the noise, what is known, and the
+coordinates of what is not. Its arrays may change without compiling again.
+
+An individual is a point of the unit cube, one coordinate per unknown: the free parameters first, then the unknown
+initial conditions of each record in turn.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ehsvjax.models.model import Equations, Model, Parameter, identity
+from ehsvjax.record import Record
+from ehsvjax.simulate import Grid, grid_of, input_array, scan_model
+
+
+class Samples(NamedTuple):
+    """Records side by side, padded at the end to the longest; `measured` is False where there is no sample."""
+
+    inputs: Float[Any, "record time input"]
+    outputs: Float[Any, "record time signal"]
+    measured: Bool[Any, "record time signal"]
+    sample_period: Float[Any, " record"]
+
+
+class Coordinates(NamedTuple):
+    """How a point of the unit cube becomes values: between bounds, on a straight or on a logarithmic scale."""
+
+    lower: Float[Any, " parameter"]
+    upper: Float[Any, " parameter"]
+    logarithmic: Bool[Any, " parameter"]
+
+
+@functools.partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["samples", "noise_variance", "coordinates", "known", "known_initial"],
+    meta_fields=["equations", "grid", "observed", "free", "free_initial", "huber"],
+)
+@dataclass(frozen=True)
+class Problem:
+    """What a candidate is judged against.
+
+    Attributes:
+        samples: the records.
+        noise_variance: `[signal]` of each observed output, in its unit squared.
+        coordinates: of the unknowns.
+        known: value of every parameter that is not free, by name.
+        known_initial: `[record]` value of every initial condition that is not free, by name.
+        equations, grid: the model's, static.
+        observed: names of the outputs that some record holds, static; the others are never computed.
+        free: names of the free parameters, static.
+        free_initial: names of the initial conditions that are free, static.
+        huber: residuals beyond this many standard deviations weigh linearly (Huber 1964); None: squares; static.
+
+    """
+
+    samples: Samples
+    noise_variance: Float[Any, " signal"]
+    coordinates: Coordinates
+    known: dict[str, Any]
+    known_initial: dict[str, Any]
+    equations: Equations
+    grid: Grid
+    observed: tuple[str, ...]
+    free: tuple[str, ...]
+    free_initial: tuple[str, ...]
+    huber: float | None
+
+    @property
+    def unknowns(self) -> int:
+        """Number of coordinates of an individual."""
+        return len(self.free) + len(self.free_initial) * self.samples.inputs.shape[0]
+
+
+def observed_outputs(model: Model, records: Sequence[Record]) -> tuple[str, ...]:
+    """Return the names of the outputs that at least one record holds, in the model's order.
+
+    Raises:
+        ValueError: if a record holds none, or one that the model does not have.
+
+    """
+    for record in records:
+        unknown = [name for name in record.outputs if name not in model.outputs]
+        if unknown or not record.outputs:
+            raise ValueError(
+                f"expected the outputs of {record.name} to be among those of {model.name}, "
+                f"{', '.join(model.outputs)}; got {', '.join(unknown) or 'none'}: name its columns accordingly, or "
+                "drop them with .select"
+            )
+    return tuple(name for name in model.outputs if any(name in record.outputs for record in records))
+
+
+def stack_records(model: Model, records: Sequence[Record]) -> tuple[Samples, Grid]:
+    """Return the records as arrays `[record, time, ...]` in NumPy float64, with the grid that serves them all.
+
+    The signals are those of `observed_outputs`; where a record does not hold one of them, nothing is measured.
+
+    Raises:
+        ValueError: if the records differ in hold, lack an input, or hold outputs that the model does not have.
+
+    """
+    holds = sorted({record.hold for record in records})
+    if len(holds) > 1:
+        raise ValueError(f"expected records with one kind of hold, got {' and '.join(holds)}")
+    longest = max(len(record) for record in records)
+
+    def padded(array, fill):
+        return np.pad(array, ((0, longest - len(array)), (0, 0)), constant_values=fill)
+
+    def measured(record):
+        absent = np.full(len(record), np.nan)
+        return np.stack([record.outputs.get(name, absent) for name in observed], axis=-1)
+
+    observed = observed_outputs(model, records)
+    stacked = np.stack([padded(measured(record), np.nan) for record in records])
+    samples = Samples(
+        inputs=np.stack([padded(input_array(model, record), 0.0) for record in records]),
+        outputs=np.nan_to_num(stacked, nan=0.0),
+        measured=np.isfinite(stacked),
+        sample_period=np.array([record.sample_period for record in records]),
+    )
+    substeps = max(grid_of(model, record).substeps for record in records)
+    return samples, Grid(substeps, holds[0])
+
+
+def coordinates_of(parameters: Sequence[Parameter]) -> Coordinates:
+    """Return the coordinates of unknowns within their bounds, in NumPy float64."""
+    return Coordinates(
+        lower=np.array([p.lower for p in parameters], float),
+        upper=np.array([p.upper for p in parameters], float),
+        logarithmic=np.array([p.scale == "log" for p in parameters], bool),
+    )
+
+
+def to_values(coordinates: Coordinates, individuals: Float[Array, "*batch parameter"]):
+    """Return the values `[..., parameter]`, SI, of individuals in the unit cube."""
+    lower, upper, logarithmic = coordinates
+    # Both branches stay finite, so that neither spoils the derivative of the other.
+    ratio = jnp.where(logarithmic, upper, 1.0) / jnp.where(logarithmic, lower, 1.0)
+    logarithmic_values = lower * jnp.exp(individuals * jnp.log(ratio))
+    return jnp.where(logarithmic, logarithmic_values, lower + individuals * (upper - lower))
+
+
+def to_unit(coordinates: Coordinates, values: Float[Array, "*batch parameter"]):
+    """Return the individuals `[..., parameter]` in the unit cube that have these values, SI."""
+    lower, upper, logarithmic = coordinates
+    ratio = jnp.where(logarithmic, upper, 2.0) / jnp.where(logarithmic, lower, 1.0)
+    relative = jnp.where(logarithmic, values / jnp.where(logarithmic, lower, 1.0), 1.0)
+    return jnp.where(logarithmic, jnp.log(relative) / jnp.log(ratio), (values - lower) / (upper - lower))
+
+
+def cast(problem: Problem, dtype) -> Problem:
+    """Return the problem with its arrays on the device, floating-point ones in this precision."""
+
+    def converted(leaf):
+        leaf = np.asarray(leaf)
+        return jnp.asarray(leaf, dtype if np.issubdtype(leaf.dtype, np.floating) else leaf.dtype)
+
+    return jax.tree.map(converted, problem)
+
+
+def population_cost(problem: Problem, individuals: Float[Array, "individual parameter"]) -> Float[Array, " individual"]:
+    """Cost of every individual: the sum of squares of its standardised residuals, over records, time and outputs.
+
+    Standardised residuals are divided by the noise's standard deviation, so that the truth costs about the number of
+    samples; beyond `huber` they weigh linearly. No trajectory is stored. A simulation that fails costs +inf.
+    """
+
+    def cost(individual):
+        parameters, initial = _split(problem, individual)
+        per_record = jax.vmap(functools.partial(_record_cost, problem, parameters))
+        total = jnp.sum(per_record(initial, problem.samples))
+        return jnp.where(jnp.isnan(total), jnp.inf, total)
+
+    return jax.vmap(cost)(individuals)
+
+
+def residuals(problem: Problem, individual: Float[Array, " parameter"]) -> Float[Array, "record time signal"]:
+    """Standardised residuals of one individual, measured minus simulated; zero where there is no sample."""
+    samples = problem.samples
+    difference = (samples.outputs - simulated(problem, individual)) / jnp.sqrt(problem.noise_variance)
+    return jnp.where(samples.measured, difference, 0.0)
+
+
+def simulated(problem: Problem, individual: Float[Array, " parameter"]) -> Float[Array, "record time signal"]:
+    """Observed outputs of one individual on every record, in their units."""
+    parameters, initial = _split(problem, individual)
+
+    def trajectory(initial, samples):
+        def keep(carry, outputs, sample):
+            return carry, jnp.stack([outputs[name] for name in problem.observed])
+
+        return _scan(problem, parameters, initial, samples, keep, None, None)[1]
+
+    return jax.vmap(trajectory)(initial, problem.samples)
+
+
+def _record_cost(problem: Problem, parameters, initial, samples: Samples):
+    scale = 1.0 / jnp.sqrt(problem.noise_variance)
+
+    def accumulate(carry, outputs, sample):
+        total, lost = carry
+        measured_outputs, measured = sample
+        terms = [
+            jnp.where(measured[i], robust_square(scale[i] * (measured_outputs[i] - outputs[name]), problem.huber), 0.0)
+            for i, name in enumerate(problem.observed)
+        ]
+        # Compensated (Kahan) summation: in float32 a sum over a million samples would lose its last digits.
+        term = sum(terms) - lost
+        following = total + term
+        return (following, (following - total) - term), None
+
+    zero = jnp.zeros((), samples.outputs.dtype)
+    rest = (samples.outputs, samples.measured)
+    (total, _), _ = _scan(problem, parameters, initial, samples, accumulate, (zero, zero), rest)
+    return total
+
+
+def robust_square(standardised: Float[Array, "..."], huber: float | None) -> Float[Array, "..."]:
+    """Return the square, or twice Huber's function: r^2 within `huber`, 2*huber*|r| - huber^2 beyond."""
+    if huber is None:
+        return standardised**2
+    size = jnp.abs(standardised)
+    return jnp.where(size > huber, 2.0 * huber * size - huber**2, standardised**2)
+
+
+def huber_weight(standardised: Float[Array, "..."], huber: float | None) -> Float[Array, "..."]:
+    """Return the weight of each standardised residual: 1, or `huber`/|r| beyond `huber`."""
+    if huber is None:
+        return jnp.ones_like(standardised)
+    return huber / jnp.maximum(jnp.abs(standardised), huber)
+
+
+def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest):
+    return scan_model(
+        problem.equations,
+        problem.grid,
+        identity,
+        parameters,
+        initial,
+        samples.inputs,
+        samples.sample_period,
+        visit,
+        carry,
+        rest,
+    )
+
+
+def _split(problem: Problem, individual) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+    """Return parameters by name, and initial conditions by name `[record]`."""
+    values = to_values(problem.coordinates, individual)
+    count = len(problem.free)
+    parameters = problem.known | dict(zip(problem.free, values[:count], strict=True))
+    by_record = values[count:].reshape(problem.samples.inputs.shape[0], len(problem.free_initial))
+    initial = problem.known_initial | dict(zip(problem.free_initial, by_record.T, strict=True))
+    return parameters, initial

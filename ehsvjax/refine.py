@@ -1,0 +1,191 @@
+"""Gradient refinement with optax, in the unit cube, until the sum of squares is as good as at its minimum."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ehsvjax.population import Problem, huber_weight, population_cost, residuals, robust_square
+
+
+class Refined(NamedTuple):
+    """Where each start has led.
+
+    Attributes:
+        individual: the best point found, in the unit cube.
+        cost: its cost, as `population_cost` counts it.
+        remaining: by how much a Gauss-Newton step would still lower the cost, to first order.
+        information: `J^T W J` there, J the standardised residuals by the coordinates: the Fisher information.
+        iterations: how many steps were taken.
+        converged: whether `remaining` fell below the tolerance.
+
+    """
+
+    individual: Float[Array, "individual parameter"]
+    cost: Float[Array, " individual"]
+    remaining: Float[Array, " individual"]
+    information: Float[Array, "individual parameter parameter"]
+    iterations: Int[Array, " individual"]
+    converged: Bool[Array, " individual"]
+
+
+class LevenbergMarquardtState(NamedTuple):
+    """The last point that was accepted, what was measured there, and the damping of the next step from it."""
+
+    point: Float[Array, " parameter"]
+    value: Float[Array, ""]
+    gradient: Float[Array, " parameter"]
+    information: Float[Array, "parameter parameter"]
+    damping: Float[Array, ""]
+
+
+def levenberg_marquardt(damping: float = 1e-3, shrink: float = 0.1, grow: float = 4.0):
+    """Levenberg-Marquardt as an optax transformation, on the unit cube.
+
+    Its `update` takes besides the gradient the `value` and the `information` (Gauss-Newton Hessian) at the parameters.
+    A step that did not lower the value is taken back: the update then leads from the last accepted point along a step
+    with more damping. Coordinates at a bound that the gradient pushes outwards are held there, the others move freely
+    (projected Gauss-Newton, Bertsekas 1982). Damping is relative to the diagonal (Marquardt 1963).
+
+    Args:
+        damping: of the first step.
+        shrink: factor of the damping after a step that lowered the value.
+        grow: factor of the damping after one that did not.
+
+    """
+
+    def init(params):
+        size = params.shape[0]
+        return LevenbergMarquardtState(
+            point=params,
+            value=jnp.asarray(jnp.inf, params.dtype),
+            gradient=jnp.zeros_like(params),
+            information=jnp.eye(size, dtype=params.dtype),
+            damping=jnp.asarray(damping / shrink, params.dtype),
+        )
+
+    def update(gradient, state, params, *, value, information, **unused):
+        del unused
+        # Written so that a NaN is not an improvement.
+        better = value < state.value
+        fresh = LevenbergMarquardtState(params, value, gradient, information, state.damping * shrink)
+        stale = state._replace(damping=state.damping * grow)
+        state = jax.tree.map(functools.partial(jnp.where, better), fresh, stale)
+        step = gauss_newton_step(state.point, state.gradient, state.information, state.damping)
+        return jnp.clip(state.point + step, 0.0, 1.0) - params, state
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def gauss_newton_step(
+    point: Float[Array, " parameter"],
+    gradient: Float[Array, " parameter"],
+    information: Float[Array, "parameter parameter"],
+    damping: float | Float[Array, ""] = 0.0,
+) -> Float[Array, " parameter"]:
+    """Return the damped Gauss-Newton step within the coordinates that are free to move.
+
+    Directions that the data do not fix (eigenvalues of the scaled information at rounding level) are left alone.
+    """
+    pushed_out = ((point <= 0.0) & (gradient > 0.0)) | ((point >= 1.0) & (gradient < 0.0))
+    diagonal = jnp.diagonal(information)
+    scale = jnp.where(pushed_out | (diagonal <= 0.0), 0.0, lax.rsqrt(jnp.where(diagonal > 0.0, diagonal, 1.0)))
+    scaled = information * scale[:, None] * scale[None, :]
+    values, vectors = jnp.linalg.eigh(scaled)
+    fixed_by_data = values > len(point) * jnp.finfo(point.dtype).eps * values[-1]
+    inverse = jnp.where(fixed_by_data, 1.0 / (jnp.where(fixed_by_data, values, 1.0) + damping), 0.0)
+    return -scale * (vectors @ (inverse * (vectors.T @ (scale * gradient))))
+
+
+@functools.partial(jax.jit, static_argnames=("optimizer", "iterations"))
+def refine(
+    problem: Problem,
+    starts: Float[Array, "individual parameter"],
+    tolerance: float | Float[Array, ""] = 1e-3,
+    *,
+    optimizer: optax.GradientTransformation | None = None,
+    iterations: int = 60,
+) -> Refined:
+    """Refine every start by itself until a further step would gain less than `tolerance` noise variances.
+
+    The noise variance is the mean square of the residuals at the point itself, so that a model that does not fit
+    well is not polished beyond what its misfit makes meaningful.
+
+    Args:
+        problem: the problem, in the precision in which to work; float64 for a tolerance that small.
+        starts: points of the unit cube.
+        tolerance: in noise variances.
+        optimizer: any optax optimizer; it is given `value`, `information`, `grad` and `value_fn` too, so that
+            `optax.lbfgs()` works. None: `levenberg_marquardt()`.
+        iterations: at most this many steps.
+
+    """
+    optimizer = optax.with_extra_args_support(levenberg_marquardt() if optimizer is None else optimizer)
+
+    def value_fn(params):
+        return 0.5 * population_cost(problem, params[None])[0]
+
+    def refine_one(start):
+        def unfinished(state):
+            _, _, best, k = state
+            return (k < iterations) & ~best.converged
+
+        def body(state):
+            params, optimizer_state, best, k = state
+            cost, gradient, information = cost_gradient_information(problem, params)
+            step = gauss_newton_step(params, gradient, information)
+            remaining = -jnp.dot(gradient, step)
+            enough = tolerance * cost / jnp.sum(problem.samples.measured)
+            here = Refined(params, cost, remaining, information, k, remaining <= enough)
+            better = cost < best.cost
+            best = jax.tree.map(functools.partial(jnp.where, better), here, best)
+            best = best._replace(iterations=k + 1)
+            updates, optimizer_state = optimizer.update(
+                gradient,
+                optimizer_state,
+                params,
+                value=0.5 * cost,
+                grad=gradient,
+                value_fn=value_fn,
+                information=information,
+            )
+            moved = optax.projections.projection_box(optax.apply_updates(params, updates), 0.0, 1.0)
+            return moved, optimizer_state, best, k + 1
+
+        size = start.shape[0]
+        nowhere = Refined(
+            individual=start,
+            cost=jnp.asarray(jnp.inf, start.dtype),
+            remaining=jnp.asarray(jnp.inf, start.dtype),
+            information=jnp.zeros((size, size), start.dtype),
+            iterations=jnp.int32(0),
+            converged=jnp.bool_(False),
+        )
+        state = start, optimizer.init(start), nowhere, jnp.int32(0)
+        return lax.while_loop(unfinished, body, state)[2]
+
+    return jax.vmap(refine_one)(starts)
+
+
+def cost_gradient_information(problem: Problem, individual: Float[Array, " parameter"]):
+    """Return the cost, half its gradient and the Gauss-Newton information of one individual.
+
+    By forward differentiation: one simulation with a tangent for every unknown, all in one pass. With a Huber cost a
+    residual weighs by its derivative over itself (iteratively reweighted least squares).
+    """
+
+    def twice(params):
+        r = residuals(problem, params)
+        return r, r
+
+    jacobian, r = jax.jacfwd(twice, has_aux=True)(individual)
+    weight = huber_weight(r, problem.huber)
+    jacobian = jacobian.reshape(-1, individual.shape[0])
+    weighted = jacobian * weight.reshape(-1, 1)
+    gradient = weighted.T @ r.reshape(-1)
+    cost = jnp.sum(robust_square(r, problem.huber))
+    return jnp.where(jnp.isnan(cost), jnp.inf, cost), gradient, weighted.T @ jacobian

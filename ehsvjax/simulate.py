@@ -1,0 +1,168 @@
+"""One trajectory of one individual: a model's equations under `lax.scan`."""
+
+import functools
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ehsvjax.integrators import repeated, scan_samples
+from ehsvjax.models.model import Equations, Model, identity
+from ehsvjax.record import Record
+
+
+class Grid(NamedTuple):
+    """How a trajectory is stepped; static, a part of what is compiled.
+
+    Attributes:
+        substeps: integration steps per sample period.
+        hold: how the inputs run between samples, "zero" or "linear".
+
+    """
+
+    substeps: int
+    hold: str
+
+
+def simulate(
+    model: Model,
+    record: Record,
+    parameters: Mapping[str, float] | None = None,
+    initial: Mapping[str, float] | None = None,
+    *,
+    substeps: int | None = None,
+    signal: Callable = identity,
+) -> dict[str, Float[np.ndarray, " time"]]:
+    """Simulate a model over a record's time and inputs, in float64.
+
+    Args:
+        model: the model.
+        record: gives time and inputs; its outputs are not looked at.
+        parameters: values that differ from the nominal ones, SI.
+        initial: initial conditions that differ from the nominal ones, SI.
+        substeps: integration steps per sample; by default as many as the model's `max_step` asks for.
+        signal: what every named signal passes through, `signal(name, value, **context) -> value`.
+
+    Returns:
+        every output of the model at the record's sample times, by name, in SI units.
+
+    Raises:
+        ValueError: for an unknown parameter, an input that the record lacks, or substeps below 1.
+
+    """
+    parameters, initial = dict(parameters or {}), dict(initial or {})
+    for name in (*parameters, *initial):
+        model.parameter(name)
+    values = model.nominal | parameters
+    start = {p.name: p.value for p in model.initial} | initial
+    grid = grid_of(model, record, substeps)
+    inputs = input_array(model, record)
+    with jax.enable_x64(True):
+        as_scalars = functools.partial(jax.tree.map, jnp.float64)
+        outputs = _simulate(
+            model.equations,
+            grid,
+            signal,
+            as_scalars(values),
+            as_scalars(start),
+            jnp.asarray(inputs),
+            jnp.float64(record.sample_period),
+        )
+    return {name: np.asarray(outputs[name]) for name in model.outputs}
+
+
+def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
+    """Return the steps per sample that the model's `max_step` asks for, with the record's hold.
+
+    Raises:
+        ValueError: for substeps that are not a positive whole number.
+
+    """
+    if substeps is None:
+        # A period that equals max_step but for rounding is one step.
+        substeps = max(1, math.ceil(record.sample_period / model.max_step * (1.0 - 1e-3)))
+    if not (isinstance(substeps, int) and substeps >= 1):
+        raise ValueError(f"expected substeps to be a whole number of at least 1, got {substeps!r}")
+    return Grid(substeps, record.hold)
+
+
+def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]:
+    """Return the record's inputs in the model's order.
+
+    Raises:
+        ValueError: if the record lacks an input of the model.
+
+    """
+    missing = [name for name in model.inputs if name not in record.inputs]
+    if missing:
+        raise ValueError(
+            f"expected {record.name} to hold the inputs of {model.name}, {', '.join(model.inputs)}; it lacks "
+            f"{', '.join(missing)} and has {', '.join(record.inputs) or 'none'}: name its columns accordingly"
+        )
+    return np.stack([record.inputs[name] for name in model.inputs], axis=-1)
+
+
+def scan_model(
+    equations: Equations,
+    grid: Grid,
+    signal: Callable,
+    parameters: Mapping[str, Any],
+    initial: Mapping[str, Any],
+    inputs: Float[Array, "time input"],
+    sample_period: Float[Array, ""],
+    visit: Callable,
+    carry: Any,
+    samples: Any,
+):
+    """Visit each sample of one trajectory: `visit(carry, outputs, sample) -> (carry, kept)`.
+
+    Args:
+        equations: the model's.
+        grid: steps per sample and hold.
+        signal: what every named signal passes through.
+        parameters: scalars by name.
+        initial: scalars by name.
+        inputs: in the order of `equations.inputs`.
+        sample_period: s.
+        visit: sees the outputs by name, at the sample itself, before the inputs act.
+        carry: what `visit` accumulates.
+        samples: pytree of arrays `[time, ...]`, of which `visit` sees a slice.
+
+    Returns:
+        the last carry, and what was kept, stacked `[time, ...]`.
+
+    """
+    following = jnp.concatenate([inputs[1:], inputs[-1:]]) if grid.hold == "linear" else inputs
+
+    def named(row):
+        return dict(zip(equations.inputs, row, strict=True))
+
+    def inputs_of(sample):
+        now, then, _ = sample
+        if grid.hold == "zero":
+            return lambda fraction: named(now)
+        return lambda fraction: named(now + fraction * (then - now))
+
+    def visit_state(carry, state, sample):
+        now, _, rest = sample
+        return visit(carry, equations.measure(parameters, state, named(now), signal), rest)
+
+    step = equations.stepper(parameters, sample_period / grid.substeps, signal)
+    state = equations.start(parameters, initial, named(inputs[0]))
+    # A state may start from Python numbers or from a float32 constant; the loop needs one type throughout.
+    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, inputs.dtype), state)
+    step = repeated(step, grid.substeps)
+    return scan_samples(step, state, visit_state, carry, (inputs, following, samples), inputs_of)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+def _simulate(equations, grid, signal, parameters, initial, inputs, sample_period):
+    def keep(carry, outputs, sample):
+        return carry, outputs
+
+    _, outputs = scan_model(equations, grid, signal, parameters, initial, inputs, sample_period, keep, None, None)
+    return outputs

@@ -1,0 +1,21 @@
+"""Strict JAX and checked shapes, under test only: users pay for neither."""
+
+import jax
+from beartype import BeartypeConf
+from jaxtyping import install_import_hook
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# PEP 484's numeric tower: an int may stand where a float is asked for.
+_typechecker = "tests.conftest.checked"
+
+
+def _install():
+    import beartype
+
+    global checked
+    checked = beartype.beartype(conf=BeartypeConf(is_pep484_tower=True))
+
+
+_install()
+install_import_hook("ehsvjax", _typechecker)
