@@ -107,7 +107,7 @@ def measure(experiment: Experiment, variance: float, draws: int, seed: int) -> t
         seconds.append(time.perf_counter() - began)
         alone.append([fit.history.best[name][-1] for name in names])
         refined.append([fit.parameters[name] for name in names])
-        lost += _cost(fit) > _cost_from_truth(model, noisy, truth) + 0.1 * variance
+        lost += cost_of(fit) > cost_from_truth(model, noisy, truth) + 0.1 * variance
         unconverged += not fit.effort.converged
     bound = ehsvjax.cramer_rao_bound(model, record, noise_variance={"position": variance})
     true, limit = np.array(list(truth.values())), np.array([bound[name] for name in names])
@@ -143,12 +143,12 @@ def _ratio(errors, limit):
     return np.sqrt(np.mean(errors**2, axis=0)) / limit
 
 
-def _cost(fit) -> float:
+def cost_of(fit) -> float:
     """Sum of squared residuals, unit squared."""
     return float(np.sum(fit.residuals()["position"] ** 2))
 
 
-def _cost_from_truth(model, record, truth) -> float:
+def cost_from_truth(model, record, truth) -> float:
     """Sum of squared residuals of a refinement from the true values, unit squared."""
     problem = problem_of(model, [record])
     values = [truth[name] for name in problem.free] + [0.0] * len(problem.free_initial)

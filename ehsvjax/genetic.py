@@ -36,8 +36,8 @@ class Operators(NamedTuple):
 
     """
 
-    selection: Selection = tournament_selection(4)
-    crossover: Crossover = differential_crossover(0.5)
+    selection: Selection = tournament_selection(5)
+    crossover: Crossover = differential_crossover(0.55)
     mutation: Mutation = gaussian_mutation(0.05)
     elites: int = 2
     immigrants: float = 0.02

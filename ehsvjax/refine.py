@@ -18,7 +18,7 @@ class Refined(NamedTuple):
     Attributes:
         individual: the best point found, in the unit cube.
         cost: its cost, as `population_cost` counts it.
-        remaining: by how much a Gauss-Newton step would still lower the cost, to first order.
+        remaining: by how much the next step would lower the cost, to first order.
         information: `J^T W J` there, J the standardised residuals by the coordinates: the Fisher information.
         iterations: how many steps were taken.
         converged: whether `remaining` fell below the tolerance.
@@ -41,20 +41,21 @@ class LevenbergMarquardtState(NamedTuple):
     gradient: Float[Array, " parameter"]
     information: Float[Array, "parameter parameter"]
     damping: Float[Array, ""]
+    growth: Float[Array, ""]
 
 
-def levenberg_marquardt(damping: float = 1e-3, shrink: float = 0.1, grow: float = 4.0):
+def levenberg_marquardt(damping: float = 1e-4, shrink: float = 0.1) -> optax.GradientTransformationExtraArgs:
     """Levenberg-Marquardt as an optax transformation, on the unit cube.
 
     Its `update` takes besides the gradient the `value` and the `information` (Gauss-Newton Hessian) at the parameters.
     A step that did not lower the value is taken back: the update then leads from the last accepted point along a step
     with more damping. Coordinates at a bound that the gradient pushes outwards are held there, the others move freely
-    (projected Gauss-Newton, Bertsekas 1982). Damping is relative to the diagonal (Marquardt 1963).
+    (projected Gauss-Newton, Bertsekas 1982). Damping is relative to the diagonal (Marquardt 1963); it grows by 2, 4, 8,
+    ... for steps in a row that did not lower the value (Nielsen 1999), so that a kink of the cost is soon recognised.
 
     Args:
         damping: of the first step.
         shrink: factor of the damping after a step that lowered the value.
-        grow: factor of the damping after one that did not.
 
     """
 
@@ -66,14 +67,16 @@ def levenberg_marquardt(damping: float = 1e-3, shrink: float = 0.1, grow: float 
             gradient=jnp.zeros_like(params),
             information=jnp.eye(size, dtype=params.dtype),
             damping=jnp.asarray(damping / shrink, params.dtype),
+            growth=jnp.asarray(2.0, params.dtype),
         )
 
     def update(gradient, state, params, *, value, information, **unused):
         del unused
         # Written so that a NaN is not an improvement.
         better = value < state.value
-        fresh = LevenbergMarquardtState(params, value, gradient, information, state.damping * shrink)
-        stale = state._replace(damping=state.damping * grow)
+        two = jnp.full_like(state.growth, 2.0)
+        fresh = LevenbergMarquardtState(params, value, gradient, information, state.damping * shrink, two)
+        stale = state._replace(damping=state.damping * state.growth, growth=2.0 * state.growth)
         state = jax.tree.map(functools.partial(jnp.where, better), fresh, stale)
         step = gauss_newton_step(state.point, state.gradient, state.information, state.damping)
         return jnp.clip(state.point + step, 0.0, 1.0) - params, state
@@ -112,8 +115,9 @@ def refine(
 ) -> Refined:
     """Refine every start by itself until a further step would gain less than `tolerance` noise variances.
 
-    The noise variance is the mean square of the residuals at the point itself, so that a model that does not fit
-    well is not polished beyond what its misfit makes meaningful.
+    The noise variance is the mean square of the residuals at the point itself, so that a model that does not fit well
+    is not polished beyond what its misfit makes meaningful. Where the cost has a kink (a saturation just reached), the
+    full Gauss-Newton step promises more than there is; what counts is what the damped step would gain.
 
     Args:
         problem: the problem, in the precision in which to work; float64 for a tolerance that small.
@@ -131,19 +135,17 @@ def refine(
 
     def refine_one(start):
         def unfinished(state):
-            _, _, best, k = state
+            *_, best, _, k = state
             return (k < iterations) & ~best.converged
 
         def body(state):
-            params, optimizer_state, best, k = state
+            params, optimizer_state, best, gradient_at_best, k = state
             cost, gradient, information = cost_gradient_information(problem, params)
-            step = gauss_newton_step(params, gradient, information)
-            remaining = -jnp.dot(gradient, step)
-            enough = tolerance * cost / jnp.sum(problem.samples.measured)
-            here = Refined(params, cost, remaining, information, k, remaining <= enough)
             better = cost < best.cost
-            best = jax.tree.map(functools.partial(jnp.where, better), here, best)
-            best = best._replace(iterations=k + 1)
+            here = best._replace(individual=params, cost=cost, information=information)
+            best, gradient_at_best = jax.tree.map(
+                functools.partial(jnp.where, better), (here, gradient), (best, gradient_at_best)
+            )
             updates, optimizer_state = optimizer.update(
                 gradient,
                 optimizer_state,
@@ -154,7 +156,12 @@ def refine(
                 information=information,
             )
             moved = optax.projections.projection_box(optax.apply_updates(params, updates), 0.0, 1.0)
-            return moved, optimizer_state, best, k + 1
+            damping = optimizer_state.damping if isinstance(optimizer_state, LevenbergMarquardtState) else 0.0
+            step = gauss_newton_step(best.individual, gradient_at_best, best.information, damping)
+            remaining = -jnp.dot(gradient_at_best, step)
+            enough = tolerance * best.cost / jnp.sum(problem.samples.measured)
+            best = best._replace(remaining=remaining, iterations=k + 1, converged=remaining <= enough)
+            return moved, optimizer_state, best, gradient_at_best, k + 1
 
         size = start.shape[0]
         nowhere = Refined(
@@ -165,7 +172,7 @@ def refine(
             iterations=jnp.int32(0),
             converged=jnp.bool_(False),
         )
-        state = start, optimizer.init(start), nowhere, jnp.int32(0)
+        state = start, optimizer.init(start), nowhere, jnp.zeros_like(start), jnp.int32(0)
         return lax.while_loop(unfinished, body, state)[2]
 
     return jax.vmap(refine_one)(starts)

@@ -77,11 +77,11 @@ def guess_noise_variance(output: Float[np.ndarray, " time"]) -> float:
 def _given_initial(model: Model, records: Sequence[Record], initial: Initial) -> list[dict[str, float]]:
     """Return the initial conditions that are known, for each record."""
     names = [p.name for p in model.initial]
+    held = {p.name: p.value for p in model.initial if p.fixed}
     if isinstance(initial, str):
         if initial not in ("estimate", "nominal"):
             raise ValueError(f"expected initial 'estimate', 'nominal' or known values by name, got {initial!r}")
-        fixed = {p.name: p.value for p in model.initial if p.fixed or initial == "nominal"}
-        return [fixed] * len(records)
+        return [held | {p.name: p.value for p in model.initial if initial == "nominal"}] * len(records)
     per_record = [initial] * len(records) if isinstance(initial, Mapping) else list(initial)
     if len(per_record) != len(records):
         raise ValueError(f"expected initial conditions for each of {len(records)} records, got {len(per_record)}")
@@ -94,7 +94,7 @@ def _given_initial(model: Model, records: Sequence[Record], initial: Initial) ->
                 raise ValueError(f"expected an initial condition of {model.name}, got {name!r}; it has {known}")
             if not np.isfinite(value):
                 raise ValueError(f"expected a finite value for {name}, got {value}")
-    return [dict(given) for given in per_record]
+    return [held | dict(given) for given in per_record]
 
 
 def _around_first_samples(parameter: Parameter, record: Record) -> Parameter:

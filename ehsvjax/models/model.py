@@ -173,7 +173,8 @@ class Model:
                 value = min(max(p.value, lower), upper)
                 # A search over both signs cannot be logarithmic.
                 scale = p.scale if lower > 0 else "linear"
-                return p._replace(lower=lower, upper=upper, value=value, fixed=False, scale=scale)
+                # Bounds given for an initial condition stand, whatever its output shows.
+                return p._replace(lower=lower, upper=upper, value=value, fixed=False, scale=scale, output=None)
             if p.name in fixed:
                 return p._replace(value=float(fixed[p.name]), fixed=True)
             return p

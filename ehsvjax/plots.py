@@ -1,0 +1,236 @@
+"""Results as pictures: each function returns a matplotlib figure, which no global state of pyplot knows about."""
+
+import functools
+import io
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.fit import Fit
+from ehsvjax.hydraulics import normalised_pressure_flow_curves
+from ehsvjax.record import Record
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+_MEASURED, _MODEL, _TRUE, _COMMAND, _AXIS = "#9aa5b1", "#c2410c", "#1f2933", "#2563a8", "#616e7c"
+
+_STYLE = {
+    "font.size": 10,
+    "axes.labelsize": 10,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": _AXIS,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.xmargin": 0.01,
+    "grid.color": "#e4e7eb",
+    "grid.linewidth": 0.8,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "lines.linewidth": 1.4,
+}
+
+_PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
+
+
+def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
+    """Draw each output of a record, measured and simulated, its residual, and the search's cost by generation.
+
+    Args:
+        fit: whose model is simulated.
+        record: one that was fitted, or a new one, whose initial conditions are then estimated first.
+
+    Raises:
+        ValueError: if the record lacks an input, or holds no output.
+
+    """
+    simulated = fit.simulate(record)
+    score = fit.score(record)
+    count = len(record.outputs)
+    with _style():
+        figure = _figure(width=9.0, height=3.4 * count + 2.2)
+        figure.suptitle(f"{fit.model.name}: {record.name}", x=0.01, ha="left", fontweight="bold")
+        *signals, search = figure.subplots(2 * count + 1, 1, height_ratios=[2.2, 1.2] * count + [2.2])
+        for i, (name, measured) in enumerate(record.outputs.items()):
+            unit = fit.model.unit(name)
+            axes, below = signals[2 * i : 2 * i + 2]
+            axes.set_title(f"fit {score.fit_percent[name]:.2f} %, rmse {_quantity(score.rmse[name], unit)}")
+            _draw_series(axes, record.time, {"measured": measured, "model": simulated[name]}, name, unit)
+            _draw_residual(below, record.time, measured - simulated[name], unit)
+        _share_time(signals, record)
+        _draw_search(search, fit)
+        figure.align_ylabels()
+    return figure
+
+
+def plot_identification(
+    fits: Fit | Sequence[Fit],
+    noise_free: Mapping[str, Float[np.ndarray, " time"]] | Sequence[Mapping[str, Float[np.ndarray, " time"]]] = (),
+) -> "matplotlib.figure.Figure":
+    """Draw the command, the noisy output, the noise-free one and the model's: figures 4 and 5 of the paper.
+
+    One column for each fit: its first record and the first output that was fitted.
+
+    Args:
+        fits: one or several.
+        noise_free: for each fit, name of the output -> `[time]` without noise in its unit, where it is known.
+
+    Raises:
+        ValueError: if as many `noise_free` as fits are not given.
+
+    """
+    fits = [fits] if isinstance(fits, Fit) else list(fits)
+    known = [noise_free] if isinstance(noise_free, Mapping) else list(noise_free)
+    if known and len(known) != len(fits):
+        raise ValueError(f"expected noise_free for each of {len(fits)} fits, got {len(known)}: leave it out or add some")
+    with _style():
+        figure = _figure(width=8.0 if len(fits) == 1 else 5.4 * len(fits), height=6.4)
+        columns = figure.subplots(3, len(fits), squeeze=False, height_ratios=[1.0, 2.4, 1.3]).T
+        for axes, fit, true in zip(columns, fits, known or [{}] * len(fits), strict=True):
+            _draw_identification(axes, fit, true)
+        figure.align_ylabels()
+    return figure
+
+
+def plot_pressure_flow() -> "matplotlib.figure.Figure":
+    """Draw the normalised pressure-flow curves of a critical-centre valve: figure 1 of the paper."""
+    openings = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
+    # Closer towards stall, where the root is steep.
+    pressures = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 401))
+    with _style():
+        figure = _figure(width=7.0, height=5.0)
+        axes = figure.subplots()
+        for side, colour in ((1.0, _COMMAND), (-1.0, _MODEL)):
+            curves = np.asarray(normalised_pressure_flow_curves(side * openings, pressures))
+            for opening, curve in zip(openings, curves, strict=True):
+                axes.plot(pressures, curve, color=colour)
+                text = f"{side * opening:+.1f}".replace("-", "\N{MINUS SIGN}")
+                axes.annotate(text, (-side, curve[0 if side > 0 else -1]), (-5 * side, 0), textcoords="offset points",
+                              ha="right" if side > 0 else "left", va="center", color=colour, fontsize=9)  # fmt: skip
+        axes.set(xlabel="load pressure $P_L / P_S$", ylabel="load flow $Q_L / Q_\\max$",
+                 xlim=(-1.22, 1.22), ylim=(-1.55, 1.55))  # fmt: skip
+        for spine in ("left", "bottom"):
+            axes.spines[spine].set_visible(False)
+        axes.tick_params(length=0)
+        axes.axhline(0, color=_AXIS, lw=0.8)
+        axes.axvline(0, color=_AXIS, lw=0.8)
+        axes.set_title("on the curves: spool opening $x_v / x_{v,\\max}$", loc="right")
+    return figure
+
+
+def _figure(width: float, height: float):
+    """Return an empty figure that a notebook shows without pyplot."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure._repr_png_ = functools.partial(to_png, figure)  # type: ignore[attr-defined]
+    return figure
+
+
+def to_png(figure: "matplotlib.figure.Figure", dots_per_inch: float = 110.0) -> bytes:
+    """Return a figure as the bytes of a PNG file."""
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dots_per_inch)
+    return file.getvalue()
+
+
+def _style():
+    import matplotlib
+
+    return matplotlib.rc_context(_STYLE)
+
+
+def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
+    command_axes, output_axes, error_axes = axes
+    record, name = fit.records[0], fit.outputs[0]
+    measured, simulated, unit = record.outputs[name], fit.simulate(record)[name], fit.model.unit(name)
+    command = fit.model.inputs[0]
+    factor, label = _scaled(record.inputs[command], fit.model.unit(command))
+    command_axes.plot(record.time, record.inputs[command] / factor, color=_COMMAND, drawstyle="steps-post")
+    command_axes.set(ylabel=f"{_words(command)}\n{label}", title=record.name)
+
+    series = {"measured": measured, "model": simulated}
+    if name in true:
+        series["noise-free"] = true[name]
+    _draw_series(output_axes, record.time, series, name, unit)
+    _draw_residual(error_axes, record.time, measured - simulated, unit)
+    if name in true:
+        factor, _ = _scaled(measured - simulated, unit)
+        error_axes.plot(record.time, (true[name] - simulated) / factor, color=_MODEL, label="noise-free − model")
+        _legend(error_axes)
+    _share_time(axes, record)
+
+
+def _draw_series(axes, time, series: Mapping[str, Any], name: str, unit: str) -> None:
+    looks = {
+        "measured": {"color": _MEASURED, "ls": "none", "marker": ".", "ms": 2.5, "rasterized": True},
+        "noise-free": {"color": _TRUE, "ls": (0, (4, 3)), "lw": 1.1},
+        "model": {"color": _MODEL},
+    }
+    factor, label = _scaled(np.concatenate(list(series.values())), unit)
+    for kind, values in series.items():
+        missing = int(np.isnan(values).sum())
+        axes.plot(time, values / factor, label=f"{kind} ({missing} missing)" if missing else kind, **looks[kind])
+    axes.set_ylabel(f"{_words(name)}\n{label}")
+    _legend(axes)
+
+
+def _draw_residual(axes, time, residual, unit: str) -> None:
+    factor, label = _scaled(residual, unit)
+    axes.plot(time, residual / factor, color=_MEASURED, ls="none", marker=".", ms=2.0, rasterized=True,
+              label="measured − model")  # fmt: skip
+    axes.axhline(0, color=_AXIS, lw=0.8)
+    axes.set_ylabel(f"residual\n{label}")
+
+
+def _draw_search(axes, fit: Fit) -> None:
+    generations = np.arange(1, len(fit.history.best_cost) + 1)
+    median = np.where(np.isfinite(fit.history.median_cost), fit.history.median_cost, np.nan)
+    axes.semilogy(generations, median, color=_MEASURED, marker=".", label="median of the generation")
+    axes.semilogy(generations, fit.history.best_cost, color=_MODEL, marker=".", label="best so far")
+    axes.set(xlabel="generation", ylabel="cost\n(noise variances)", title="genetic search")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    _legend(axes)
+
+
+def _legend(axes) -> None:
+    """Put the legend above the right end of the axes, where no data can lie."""
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3, borderaxespad=0.0, markerscale=3,
+                columnspacing=1.2, handlelength=1.6)  # fmt: skip
+
+
+def _share_time(axes, record: Record) -> None:
+    """Give axes that stand above each other the record's time, written below the last."""
+    for upper in axes[:-1]:
+        upper.sharex(axes[-1])
+        upper.tick_params(labelbottom=False)
+    axes[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1] + record.sample_period))
+
+
+def _scaled(values, unit: str) -> tuple[float, str]:
+    """Return what to divide by, and the unit as it then reads in a label: metres of a few thousandths are in mm."""
+    largest = float(np.nanmax(np.abs(values)))
+    prefix = _prefix(largest, unit)
+    return _PREFIXES[prefix], f"({prefix}{unit})" if unit else "(–)"
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _quantity(value: float, unit: str) -> str:
+    prefix = _prefix(value, unit)
+    return f"{value / _PREFIXES[prefix]:.3g} {prefix}{unit}".rstrip()
+
+
+def _prefix(largest: float, unit: str) -> str:
+    """Return the prefix that leaves a number of at least 1, for units that take one."""
+    if unit not in ("m", "m/s", "Pa", "N", "V", "A") or not 0.0 < largest < math.inf:
+        return ""
+    return next((prefix for prefix, factor in _PREFIXES.items() if largest >= factor), "n")

@@ -1,0 +1,140 @@
+"""A fit in words: plain text in lmfit's manner, and the same as HTML for notebooks."""
+
+import math
+from collections.abc import Iterator
+from html import escape
+from typing import NamedTuple
+
+import numpy as np
+
+from ehsvjax.fit import Effort, Fit
+from ehsvjax.models.model import Model, Parameter
+from ehsvjax.record import Record
+
+
+def summary(fit: Fit) -> str:
+    """Return the model, records, statistics, parameters and warnings of a fit as text, SI units.
+
+    The sections are those of lmfit's fit report (Newville et al., lmfit-py).
+    """
+    return "\n".join(line for section in _sections(fit) for line in _text_lines(section))
+
+
+def summary_html(fit: Fit) -> str:
+    """Return `summary` as an HTML fragment: tables without scripts, colours or outside resources.
+
+    Every text that a user may have chosen (names of records, signals, parameters and their units) is escaped.
+    """
+    return f'<div style="max-width: 60em">{"".join(_html_table(section) for section in _sections(fit))}</div>'
+
+
+class _Section(NamedTuple):
+    """A titled table; `head` names its columns where that needs saying."""
+
+    title: str
+    rows: list[tuple[str, ...]]
+    head: tuple[str, ...] = ()
+
+
+def _sections(fit: Fit) -> Iterator[_Section]:
+    yield _Section("Model", _model_rows(fit.model))
+    records = "Record" if len(fit.records) == 1 else "Records"
+    head = ("name", "samples", "missing", "period", "duration")
+    yield _Section(records, [_record_row(record) for record in fit.records], head)
+    yield _Section("Fit statistics", _statistics_rows(fit))
+    head = ("output", "rmse", "fit", "noise standard deviation")
+    yield _Section("Outputs", _output_rows(fit), head)
+    head = ("name", "symbol", "value", "unit", "bounds")
+    yield _Section("Parameters", [_parameter_row(fit, p) for p in fit.model.parameters], head)
+    if fit.model.initial:
+        yield _initial_section(fit)
+    yield _Section("Warnings", [(warning,) for warning in fit.warnings or ("none",)])
+
+
+def _model_rows(model: Model) -> list[tuple[str, ...]]:
+    rows = [("name", model.name), ("signals", f"{', '.join(model.inputs)} -> {', '.join(model.outputs)}")]
+    names = {p.name for p in model.parameters}
+    options = [f"{name}={value!r}" for name, value in model.options if name not in names]
+    return [*rows, ("options", ", ".join(options))] if options else rows
+
+
+def _record_row(record: Record) -> tuple[str, ...]:
+    counts = {name: int(np.isnan(values).sum()) for name, values in record.outputs.items()}
+    missing = ", ".join(f"{count} of {name}" for name, count in counts.items() if count)
+    return record.name, f"{len(record)}", missing or "none", f"{record.sample_period:.4g} s", f"{record.duration:.4g} s"
+
+
+def _statistics_rows(fit: Fit) -> list[tuple[str, ...]]:
+    effort = fit.effort
+    samples = sum(int(np.isfinite(y).sum()) for record in fit.records for y in record.outputs.values())
+    rows = [
+        ("method", f"genetic algorithm, {_search(effort)}"),
+        ("refinement", _refinement(effort)),
+        ("samples", f"{samples} measured"),
+        ("unknowns", f"{len(fit.parameters)} parameters, and the initial conditions that are estimated"),
+        ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}"),
+    ]
+    if fit.huber is not None:
+        rows.insert(2, ("residuals", f"weighed linearly beyond {fit.huber:g} standard deviations (Huber)"))
+    return rows
+
+
+def _search(effort: Effort) -> str:
+    sizes = f"{effort.population} individuals x {effort.generations} generations = {effort.simulations} simulations"
+    return f"{sizes}; ended by its stop test" if effort.stopped_early else sizes
+
+
+def _refinement(effort: Effort) -> str:
+    if not effort.refined:
+        return "none"
+    steps = f"{effort.iterations} steps by gradient, {'converged' if effort.converged else 'not converged'}"
+    return f"{steps}; {effort.starts_agreeing} of {effort.starts} starts led to this minimum"
+
+
+def _cost_unit(fit: Fit) -> str:
+    if len(fit.outputs) > 1:
+        return "s (each output over its noise variance)"
+    unit = fit.model.unit(fit.outputs[0])
+    return f"({unit})^2 s" if unit and not unit.isalpha() else f"{unit}^2 s" if unit else "s"
+
+
+def _output_rows(fit: Fit) -> list[tuple[str, ...]]:
+    rmse, fit_percent = fit.rmse, fit.fit_percent
+    deviation = {name: math.sqrt(variance) for name, variance in fit.noise_variance.items()}
+    units = {name: fit.model.unit(name) for name in fit.outputs}
+    return [
+        (name, f"{rmse[name]:.3e} {unit}", f"{fit_percent[name]:.2f} %", f"{deviation[name]:.3e} {unit}")
+        for name, unit in units.items()
+    ]
+
+
+def _parameter_row(fit: Fit, parameter: Parameter) -> tuple[str, ...]:
+    identified = parameter.name in fit.parameters
+    value = fit.parameters[parameter.name] if identified else parameter.value
+    bounds = f"{parameter.lower:.6g} .. {parameter.upper:.6g}" if identified else "(fixed)"
+    return parameter.name, parameter.symbol, f"{value:.6g}", parameter.unit, bounds
+
+
+def _initial_section(fit: Fit) -> _Section:
+    """One row for each initial condition, one column for each record."""
+    names = [record.name for record in fit.records]
+    rows = [
+        (p.name, p.symbol, *(f"{values[p.name]:.6g}" for values in fit.initial), p.unit) for p in fit.model.initial
+    ]
+    values = ["value"] if len(names) == 1 else names
+    return _Section("Initial conditions", rows, ("name", "symbol", *values, "unit"))
+
+
+def _text_lines(section: _Section) -> list[str]:
+    rows = [section.head, *section.rows] if section.head else section.rows
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
+    return [f"[[{section.title}]]", *(f"    {line}".rstrip() for line in lines)]
+
+
+def _html_table(section: _Section) -> str:
+    cell = 'style="text-align: left; padding: 0.1em 1em 0.1em 0"'
+    rows = [f"<tr>{''.join(f'<th {cell}>{escape(name)}</th>' for name in section.head)}</tr>"] if section.head else []
+    rows += [f"<tr>{''.join(f'<td {cell}>{escape(text)}</td>' for text in row)}</tr>" for row in section.rows]
+    title = f'<p style="margin: 0.6em 0 0.1em"><b>{section.title}</b></p>'
+    return f'{title}<table style="border-collapse: collapse">{"".join(rows)}</table>'
