@@ -192,7 +192,8 @@ def _record(
         raise ValueError(f"expected a noise variance of zero or more, got {noise_variance!r}")
     excitation_key = jax.random.key(_EXCITATION_SEED)
     command = pseudo_random_signal(excitation_key, amplitude=amplitude, hold_time=hold_time, **timing)
-    name = f"{model.name}, noise variance {noise_variance:g}"
+    unit = model.unit("position")
+    name = f"{model.name}, noise variance {noise_variance:g}{f' {unit}²' if unit else ''}"
     record = Record(sample_times(**timing), {"command": command}, name=name)
     position = simulate(model, record, truth, substeps=substeps)["position"]
     noise = np.asarray(jax.random.normal(key, position.shape), np.float64)
@@ -227,7 +228,10 @@ def _table(
         rows[variance, "Cramér-Rao bound"] = {
             (name, kind): value
             for name, true in truth.items()
-            for kind, value in (("value", identification.bound[name]), ("error %", 100 * identification.bound[name] / true))
+            for kind, value in (
+                ("value", identification.bound[name]),
+                ("error %", 100 * identification.bound[name] / true),
+            )
         }
     table = pd.DataFrame.from_dict(rows, orient="index")
     table.index = pd.MultiIndex.from_tuples(rows, names=["noise variance", "row"])

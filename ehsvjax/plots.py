@@ -88,7 +88,9 @@ def plot_identification(
     fits = [fits] if isinstance(fits, Fit) else list(fits)
     known = [noise_free] if isinstance(noise_free, Mapping) else list(noise_free)
     if known and len(known) != len(fits):
-        raise ValueError(f"expected noise_free for each of {len(fits)} fits, got {len(known)}: leave it out or add some")
+        raise ValueError(
+            f"expected noise_free for each of {len(fits)} fits, got {len(known)}: leave it out or add some"
+        )
     with _style():
         figure = _figure(width=8.0 if len(fits) == 1 else 5.4 * len(fits), height=6.4)
         columns = figure.subplots(3, len(fits), squeeze=False, height_ratios=[1.0, 2.4, 1.3]).T

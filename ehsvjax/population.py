@@ -142,7 +142,7 @@ def coordinates_of(parameters: Sequence[Parameter]) -> Coordinates:
 
 def to_values(coordinates: Coordinates, individuals: Float[Array, "*batch parameter"]):
     """Return the values `[..., parameter]`, SI, of individuals in the unit cube."""
-    lower, upper, logarithmic = coordinates
+    lower, upper, logarithmic = (jnp.broadcast_to(c, jnp.shape(individuals)) for c in coordinates)
     # Both branches stay finite, so that neither spoils the derivative of the other.
     ratio = jnp.where(logarithmic, upper, 1.0) / jnp.where(logarithmic, lower, 1.0)
     logarithmic_values = lower * jnp.exp(individuals * jnp.log(ratio))
@@ -151,7 +151,7 @@ def to_values(coordinates: Coordinates, individuals: Float[Array, "*batch parame
 
 def to_unit(coordinates: Coordinates, values: Float[Array, "*batch parameter"]):
     """Return the individuals `[..., parameter]` in the unit cube that have these values, SI."""
-    lower, upper, logarithmic = coordinates
+    lower, upper, logarithmic = (jnp.broadcast_to(c, jnp.shape(values)) for c in coordinates)
     ratio = jnp.where(logarithmic, upper, 2.0) / jnp.where(logarithmic, lower, 1.0)
     relative = jnp.where(logarithmic, values / jnp.where(logarithmic, lower, 1.0), 1.0)
     return jnp.where(logarithmic, jnp.log(relative) / jnp.log(ratio), (values - lower) / (upper - lower))
@@ -186,7 +186,7 @@ def population_cost(problem: Problem, individuals: Float[Array, "individual para
 def residuals(problem: Problem, individual: Float[Array, " parameter"]) -> Float[Array, "record time signal"]:
     """Standardised residuals of one individual, measured minus simulated; zero where there is no sample."""
     samples = problem.samples
-    difference = (samples.outputs - simulated(problem, individual)) / jnp.sqrt(problem.noise_variance)
+    difference = (samples.outputs - simulated(problem, individual)) / jnp.sqrt(problem.noise_variance)[None, None, :]
     return jnp.where(samples.measured, difference, 0.0)
 
 

@@ -2,13 +2,14 @@
 
 import base64
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
 import ehsvjax.paper as paper
 from ehsvjax.models import Model, servovalve, van_der_pol
@@ -69,7 +70,7 @@ def _identification_figure(identifications: Sequence[Identification]):
 
 def _page(pictures: Mapping[str, bytes], **context: Any) -> str:
     environment = Environment(loader=PackageLoader("ehsvjax", "."), autoescape=True, undefined=StrictUndefined)
-    environment.filters |= {"number": _number, "signed": _signed}
+    environment.filters |= {"number": _number, "signed": _signed, "percent": _percent, "unit": _unit, "symbol": _symbol}
     images = {name: f"data:image/png;base64,{base64.b64encode(png).decode()}" for name, png in pictures.items()}
     return environment.get_template("report.html").render(images=images, **context)
 
@@ -121,11 +122,26 @@ def _number(value: float, digits: int = 4) -> Markup:
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     power = str(int(exponent)).replace("-", "−")
     mantissa = mantissa.rstrip("0").rstrip(".").replace("-", "−")
-    return Markup(f"10<sup>{power}</sup>") if mantissa == "1" else Markup(f"{mantissa}&thinsp;×&thinsp;10<sup>{power}</sup>")
+    return (
+        Markup(f"10<sup>{power}</sup>")
+        if mantissa == "1"
+        else Markup(f"{mantissa}&thinsp;×&thinsp;10<sup>{power}</sup>")
+    )
 
 
-def _signed(value: float, digits: int = 1) -> str:
-    """Return a per cent with its sign; two significant digits where it is small."""
-    size = abs(value)
-    digits = digits if size >= 1 else 2 if size >= 0.095 or size == 0 else 3
-    return f"{value:+.{digits}f}".replace("-", "−") + " %"
+def _signed(error: float) -> str:
+    return (f"{error:+.1f} %" if abs(error) >= 1 else f"{round(error, 4):+.2g} %").replace("-", "−")
+
+
+def _percent(deviation: float) -> str:
+    return f"±{deviation:.0f} %" if deviation >= 10 else f"±{deviation:.2g} %"
+
+
+def _unit(unit: str) -> Markup:
+    """Return a unit with its exponents raised."""
+    return Markup(re.sub(r"\^(-?[\d.]+)", r"<sup>\1</sup>", str(escape(unit)))) if unit else Markup("–")
+
+
+def _symbol(symbol: str) -> Markup:
+    """Return a symbol with what follows its first letter lowered."""
+    return escape(symbol[:1]) + Markup("<sub>{}</sub>").format(symbol[1:]) if symbol[1:] else escape(symbol)

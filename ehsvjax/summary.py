@@ -118,9 +118,7 @@ def _parameter_row(fit: Fit, parameter: Parameter) -> tuple[str, ...]:
 def _initial_section(fit: Fit) -> _Section:
     """One row for each initial condition, one column for each record."""
     names = [record.name for record in fit.records]
-    rows = [
-        (p.name, p.symbol, *(f"{values[p.name]:.6g}" for values in fit.initial), p.unit) for p in fit.model.initial
-    ]
+    rows = [(p.name, p.symbol, *(f"{values[p.name]:.6g}" for values in fit.initial), p.unit) for p in fit.model.initial]
     values = ["value"] if len(names) == 1 else names
     return _Section("Initial conditions", rows, ("name", "symbol", *values, "unit"))
 

@@ -155,7 +155,7 @@ def test_a_constant_at_any_signal_is_seen(name):
             # A sensor's error is added to its own reading, and stays there.
             for output in model.outputs:
                 shift = size if output == signal.name else 0.0
-                np.testing.assert_array_equal(outputs[output], nominal[output] + shift)
+                np.testing.assert_allclose(outputs[output], nominal[output] + shift, rtol=1e-14)
         else:
             moved = {o: np.abs(outputs[o] - nominal[o]).max() / nominal[o].std() for o in model.outputs}
             assert max(moved.values()) > 1e-4, (signal.name, moved)
