@@ -1,9 +1,9 @@
 """The paper's two experiments again: its tables as printed, records like its own, and its tables made anew.
 
-The paper does not say how its pseudo random signals and records were made. Assumed here: uniform random levels, +-2 held
-1 s for 40 s sampled at 50 Hz (Van der Pol), +-6 mm of spool stroke held 0.2 s for 4 s sampled at 1 kHz (servovalve); both
-start from rest, which the identification does not know and estimates. For every noise variance the excitation is the
-same, and the key draws the noise.
+The paper does not say how its pseudo random signals and records were made. Assumed here: uniform random levels, +-2
+held 1 s for 40 s sampled at 50 Hz (Van der Pol), +-6 mm of spool stroke held 0.2 s for 4 s sampled at 1 kHz
+(servovalve); both start from rest, which the identification does not know and estimates. For every noise variance the
+excitation is the same, and the key draws the noise.
 """
 
 import math
@@ -14,7 +14,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Key
 
 from ehsvjax.excitation import pseudo_random_signal, sample_times
 from ehsvjax.fit import Fit
@@ -46,7 +46,8 @@ SERVOVALVE_TRUTH = {
 PRINTED_FLOW_GAIN = 1e-5
 """H as the row "Real" of table 2 prints it, a misprint; its unit is printed (m^3/kg)^(1/2) and is m^2.5 kg^-0.5.
 
-The three values in the table were searched within +-50% of the true one, which must thus lie between 1.05e-4 and 2.8e-4.
+The three values in the table were searched within +-50% of the true one, which must thus lie between 1.05e-4 and
+2.8e-4.
 """
 
 PAPER_TABLE_2 = {
@@ -145,8 +146,8 @@ def table_2(identifications: Sequence[Identification]) -> pd.DataFrame:
     """Return the paper's table 2 with the new rows.
 
     Index: noise variance and row, which is "paper", "GA alone", "GA and refinement" or "Cramér-Rao bound". Columns: for
-    each parameter its value, SI, and its error in per cent of the true value; in the last row the standard deviation that no
-    unbiased estimate can beat, and the same in per cent.
+    each parameter its value, SI, and its error in per cent of the true value; in the last row the standard deviation
+    that no unbiased estimate can beat, and the same in per cent.
 
     Raises:
         ValueError: for a noise variance that the paper's table does not have.
@@ -163,7 +164,7 @@ def table_text(table: pd.DataFrame, model: Model, truth: Mapping[str, float]) ->
         ["", *(p.unit for p in parameters)],
         ["true", *(f"{truth[p.name]:.5g}" for p in parameters)],
     ]
-    for (variance, row), values in table.iterrows():
+    for (variance, row), values in zip(table.index.tolist(), table.to_dict("records"), strict=True):
         errors = [values[name, "error %"] for name in truth]
         if row == "paper":
             lines += [[], [f"noise variance {variance:g}"]]
@@ -235,7 +236,7 @@ def _table(
         }
     table = pd.DataFrame.from_dict(rows, orient="index")
     table.index = pd.MultiIndex.from_tuples(rows, names=["noise variance", "row"])
-    table.columns = pd.MultiIndex.from_tuples(table.columns, names=["parameter", ""])
+    table.columns = pd.MultiIndex.from_tuples(table.columns.tolist(), names=["parameter", ""])
     return table
 
 

@@ -170,7 +170,7 @@ def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
 
 
 def _draw_series(axes, time, series: Mapping[str, Any], name: str, unit: str) -> None:
-    looks = {
+    looks: dict[str, dict[str, Any]] = {
         "measured": {"color": _MEASURED, "ls": "none", "marker": ".", "ms": 2.5, "rasterized": True},
         "noise-free": {"color": _TRUE, "ls": (0, (4, 3)), "lw": 1.1},
         "model": {"color": _MODEL},

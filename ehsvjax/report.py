@@ -130,7 +130,8 @@ def _number(value: float, digits: int = 4) -> Markup:
 
 
 def _signed(error: float) -> str:
-    return (f"{error:+.1f} %" if abs(error) >= 1 else f"{round(error, 4):+.2g} %").replace("-", "−")
+    small = round(error, 4)
+    return (f"{error:+.1f} %" if abs(error) >= 1 else f"{small:+.2g} %" if small else "0 %").replace("-", "−")
 
 
 def _percent(deviation: float) -> str:

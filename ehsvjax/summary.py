@@ -1,7 +1,7 @@
 """A fit in words: plain text in lmfit's manner, and the same as HTML for notebooks."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 from typing import NamedTuple
 
@@ -32,30 +32,32 @@ class _Section(NamedTuple):
     """A titled table; `head` names its columns where that needs saying."""
 
     title: str
-    rows: list[tuple[str, ...]]
+    rows: Sequence[tuple[str, ...]]
     head: tuple[str, ...] = ()
+
+
+_OUTPUT_HEAD = ("output", "rmse", "fit", "noise standard deviation")
+_PARAMETER_HEAD = ("name", "symbol", "value", "unit", "bounds")
+_RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
 
 
 def _sections(fit: Fit) -> Iterator[_Section]:
     yield _Section("Model", _model_rows(fit.model))
-    records = "Record" if len(fit.records) == 1 else "Records"
-    head = ("name", "samples", "missing", "period", "duration")
-    yield _Section(records, [_record_row(record) for record in fit.records], head)
+    title = "Record" if len(fit.records) == 1 else "Records"
+    yield _Section(title, [_record_row(record) for record in fit.records], _RECORD_HEAD)
     yield _Section("Fit statistics", _statistics_rows(fit))
-    head = ("output", "rmse", "fit", "noise standard deviation")
-    yield _Section("Outputs", _output_rows(fit), head)
-    head = ("name", "symbol", "value", "unit", "bounds")
-    yield _Section("Parameters", [_parameter_row(fit, p) for p in fit.model.parameters], head)
+    yield _Section("Outputs", _output_rows(fit), _OUTPUT_HEAD)
+    yield _Section("Parameters", [_parameter_row(fit, p) for p in fit.model.parameters], _PARAMETER_HEAD)
     if fit.model.initial:
         yield _initial_section(fit)
     yield _Section("Warnings", [(warning,) for warning in fit.warnings or ("none",)])
 
 
-def _model_rows(model: Model) -> list[tuple[str, ...]]:
+def _model_rows(model: Model) -> Sequence[tuple[str, ...]]:
     rows = [("name", model.name), ("signals", f"{', '.join(model.inputs)} -> {', '.join(model.outputs)}")]
     names = {p.name for p in model.parameters}
-    options = [f"{name}={value!r}" for name, value in model.options if name not in names]
-    return [*rows, ("options", ", ".join(options))] if options else rows
+    options = ", ".join(f"{name}={value!r}" for name, value in model.options if name not in names)
+    return [*rows, ("options", options)] if options else rows
 
 
 def _record_row(record: Record) -> tuple[str, ...]:
@@ -64,7 +66,7 @@ def _record_row(record: Record) -> tuple[str, ...]:
     return record.name, f"{len(record)}", missing or "none", f"{record.sample_period:.4g} s", f"{record.duration:.4g} s"
 
 
-def _statistics_rows(fit: Fit) -> list[tuple[str, ...]]:
+def _statistics_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     effort = fit.effort
     samples = sum(int(np.isfinite(y).sum()) for record in fit.records for y in record.outputs.values())
     rows = [
@@ -98,7 +100,7 @@ def _cost_unit(fit: Fit) -> str:
     return f"({unit})^2 s" if unit and not unit.isalpha() else f"{unit}^2 s" if unit else "s"
 
 
-def _output_rows(fit: Fit) -> list[tuple[str, ...]]:
+def _output_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     rmse, fit_percent = fit.rmse, fit.fit_percent
     deviation = {name: math.sqrt(variance) for name, variance in fit.noise_variance.items()}
     units = {name: fit.model.unit(name) for name in fit.outputs}
