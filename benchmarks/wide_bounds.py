@@ -78,8 +78,8 @@ def main() -> None:
     print(f"\nservovalve, variance {options.variance:g}, every parameter's bounds with a ratio of {options.width:g}")
     print(table.to_string(index=False, float_format=lambda v: f"{v:.3g}"))
     print(
-        f"{found} of {options.draws} draws reached the minimum, with {int(table['simulations'].max())} simulations each "
-        f"and {table['seconds'].median():.1f} s (median)"
+        f"{found} of {options.draws} draws reached the minimum, with {int(table['simulations'].max())} simulations "
+        f"each and {table['seconds'].median():.1f} s (median)"
     )
     stem = options.out / f"wide_bounds_{options.width:g}"
     stem.with_suffix(".json").write_text(

@@ -1,6 +1,7 @@
-"""The demo: `python -m ehsvjax [--out DIR]` redoes the paper's two identifications and writes its figures and tables."""
+"""The demo, `python -m ehsvjax [--out DIR]`: the paper's two identifications again, with its figures and tables."""
 
 import argparse
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -42,7 +43,7 @@ def _identify_each(identify: Callable[..., Identification], key, noise_variances
     identifications = []
     for i, variance in enumerate(noise_variances):
         began = time.perf_counter()
-        identification = identify(jax.random.fold_in(key, i), variance, progress=True)
+        identification = identify(jax.random.fold_in(key, i), variance, progress=sys.stderr.isatty())
         effort = identification.fit.effort
         print(
             f"  noise variance {variance:g}: {effort.simulations} simulations, then {effort.iterations} gradient steps "

@@ -97,8 +97,8 @@ def identify(
     individual = np.asarray(found.elites[0], np.float64)
     if refine:
         candidates = _candidates(problem, model, found, starts)
-        refined, problem = _refine_and_reweigh(problem, candidates, reweigh=noise_variance is None)
-        individual, effort = _best_of(refined, effort)
+        refined, agreeing, problem = _refine_and_reweigh(problem, candidates, reweigh=noise_variance is None)
+        individual, effort = _best_of(refined, agreeing, effort)
     elif noise_variance is None:
         problem = replace(problem, noise_variance=_residual_variance(problem, individual))
     return _fit(model, records, problem, individual, history, effort)
@@ -127,7 +127,7 @@ def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
     problem = problem_of(known, [record], noise_variance=variance, huber=fit.huber)
     middle = np.full(problem.unknowns, 0.5)
     starts = np.stack([middle, _with_nominal_initial(problem, known, middle)])
-    refined, problem = _refine_and_reweigh(problem, starts, reweigh=False)
+    refined, _, problem = _refine_and_reweigh(problem, starts, reweigh=False)
     best = refined.individual[int(np.argmin(refined.cost))]
     return _initial_by_record(known, problem, best)[0]
 
@@ -193,15 +193,18 @@ def _with_nominal_initial(problem: Problem, model: Model, individual) -> Float[n
     return changed
 
 
-def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refined, Problem]:
+def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refined, int, Problem]:
     """Refine; then, while the weights of the outputs still change, weigh them by their residuals and refine again.
 
-    With one output and squared residuals the weight does not move the minimum, and one round is enough.
+    With one output and squared residuals the weight does not move the minimum, and one round is enough. The number
+    returned says how many starts came to within a tenth of a noise variance of the same minimum, in the first round.
     """
     with jax.enable_x64(True):
         refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64)))
+        least = np.min(refined.cost)
+        agreeing = int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))
         if not reweigh:
-            return refined, problem
+            return refined, agreeing, problem
         several = len(problem.observed) > 1 or problem.huber is not None
         for _ in range(10 if several else 1):
             best = refined.individual[np.argmin(refined.cost)]
@@ -210,8 +213,10 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
             problem = replace(problem, noise_variance=variance)
             if settled or not several:
                 break
-            refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(refined.individual)))
-        return refined, problem
+            # From the best alone, as often as there were starts: the same shape is not compiled again.
+            again = np.broadcast_to(best, refined.individual.shape)
+            refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(again)))
+        return refined, agreeing, problem
 
 
 def _in_numpy(refined: Refined) -> Refined:
@@ -234,13 +239,13 @@ def _residual_variance(problem: Problem, individual) -> Float[np.ndarray, " sign
     return np.array(variances)
 
 
-def _best_of(refined: Refined, effort: Effort) -> tuple[Float[np.ndarray, " parameter"], Effort]:
+def _best_of(refined: Refined, agreeing: int, effort: Effort) -> tuple[Float[np.ndarray, " parameter"], Effort]:
     best = int(np.argmin(refined.cost))
     return np.asarray(refined.individual[best]), effort._replace(
         refined=True,
         iterations=int(refined.iterations[best]),
         starts=len(refined.cost),
-        starts_agreeing=int(np.sum(refined.cost <= refined.cost[best] * (1 + 1e-4))),
+        starts_agreeing=agreeing,
         converged=bool(refined.converged[best]),
         remaining=float(refined.remaining[best]),
     )

@@ -60,6 +60,9 @@ PAPER_TABLE_2 = {
 }
 """Noise variance, m^2 -> identified parameters, SI, as printed."""
 
+BOUND = "Cramér-Rao bound"
+"""Name of a table's last row for each noise variance."""
+
 _EXCITATION_SEED = 1
 
 
@@ -159,6 +162,7 @@ def table_2(identifications: Sequence[Identification]) -> pd.DataFrame:
 def table_text(table: pd.DataFrame, model: Model, truth: Mapping[str, float]) -> str:
     """Return a table as text for a terminal of 100 columns: each value above its error."""
     parameters = [model.parameter(name) for name in truth]
+    squared = _squared(model.unit("position"))
     lines = [
         ["", *(p.symbol for p in parameters)],
         ["", *(p.unit for p in parameters)],
@@ -167,9 +171,9 @@ def table_text(table: pd.DataFrame, model: Model, truth: Mapping[str, float]) ->
     for (variance, row), values in zip(table.index.tolist(), table.to_dict("records"), strict=True):
         errors = [values[name, "error %"] for name in truth]
         if row == "paper":
-            lines += [[], [f"noise variance {variance:g}"]]
-        if row == "Cramér-Rao bound":
-            lines.append([f"  {row}", *(f"±{error:.2f}%" for error in errors)])
+            lines += [[], [f"noise variance {variance:g}{squared}"]]
+        if row == BOUND:
+            lines.append([f"  {row}", *(f"±{error:.2g}%" for error in errors)])
         else:
             lines.append([f"  {row}", *(f"{values[name, 'value']:.5g}" for name in truth)])
             lines.append(["", *(f"{error:+.2f}%" for error in errors)])
@@ -193,12 +197,15 @@ def _record(
         raise ValueError(f"expected a noise variance of zero or more, got {noise_variance!r}")
     excitation_key = jax.random.key(_EXCITATION_SEED)
     command = pseudo_random_signal(excitation_key, amplitude=amplitude, hold_time=hold_time, **timing)
-    unit = model.unit("position")
-    name = f"{model.name}, noise variance {noise_variance:g}{f' {unit}²' if unit else ''}"
+    name = f"{model.name}, noise variance {noise_variance:g}{_squared(model.unit('position'))}"
     record = Record(sample_times(**timing), {"command": command}, name=name)
     position = simulate(model, record, truth, substeps=substeps)["position"]
     noise = np.asarray(jax.random.normal(key, position.shape), np.float64)
     return replace(record, outputs={"position": position + math.sqrt(noise_variance) * noise})
+
+
+def _squared(unit: str) -> str:
+    return f" {unit}²" if unit else ""
 
 
 def _identification(model, truth, key, noisy, clean, noise_variance, sizes, progress) -> Identification:
@@ -222,27 +229,15 @@ def _table(
         raise ValueError(f"expected noise variances of the paper, {variances}, got {unknown[0]:g}")
     rows = {}
     for identification in identifications:
-        variance = identification.noise_variance
+        variance, bound = identification.noise_variance, identification.bound
         rows[variance, "paper"] = _values_and_errors(printed[variance], truth)
         rows[variance, "GA alone"] = _values_and_errors(identification.by_search, truth)
         rows[variance, "GA and refinement"] = _values_and_errors(identification.fit.parameters, truth)
-        rows[variance, "Cramér-Rao bound"] = {
-            (name, kind): value
-            for name, true in truth.items()
-            for kind, value in (
-                ("value", identification.bound[name]),
-                ("error %", 100 * identification.bound[name] / true),
-            )
-        }
-    table = pd.DataFrame.from_dict(rows, orient="index")
-    table.index = pd.MultiIndex.from_tuples(rows, names=["noise variance", "row"])
-    table.columns = pd.MultiIndex.from_tuples(table.columns.tolist(), names=["parameter", ""])
-    return table
+        rows[variance, BOUND] = [x for name, true in truth.items() for x in (bound[name], 100 * bound[name] / true)]
+    index = pd.MultiIndex.from_tuples(rows, names=["noise variance", "row"])
+    columns = pd.MultiIndex.from_product([list(truth), ["value", "error %"]], names=["parameter", ""])
+    return pd.DataFrame(list(rows.values()), index, columns)
 
 
-def _values_and_errors(values: Mapping[str, float], truth: Mapping[str, float]) -> dict[tuple[str, str], float]:
-    return {
-        (name, kind): value
-        for name, true in truth.items()
-        for kind, value in (("value", values[name]), ("error %", 100 * (values[name] / true - 1)))
-    }
+def _values_and_errors(values: Mapping[str, float], truth: Mapping[str, float]) -> list[float]:
+    return [x for name, true in truth.items() for x in (values[name], 100 * (values[name] / true - 1))]

@@ -50,6 +50,8 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
         ValueError: if the record lacks an input, or holds no output.
 
     """
+    if not record.outputs:
+        raise ValueError(f"expected {record.name} to hold an output to draw, got none: use fit.simulate(record)")
     simulated = fit.simulate(record)
     score = fit.score(record)
     count = len(record.outputs)
@@ -75,7 +77,7 @@ def plot_identification(
 ) -> "matplotlib.figure.Figure":
     """Draw the command, the noisy output, the noise-free one and the model's: figures 4 and 5 of the paper.
 
-    One column for each fit: its first record and the first output that was fitted.
+    One column for each fit: its first record, and the first output of that.
 
     Args:
         fits: one or several.
@@ -150,11 +152,13 @@ def _style():
 
 def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
     command_axes, output_axes, error_axes = axes
-    record, name = fit.records[0], fit.outputs[0]
+    record = fit.records[0]
+    name = next(name for name in fit.outputs if name in record.outputs)
     measured, simulated, unit = record.outputs[name], fit.simulate(record)[name], fit.model.unit(name)
     command = fit.model.inputs[0]
     factor, label = _scaled(record.inputs[command], fit.model.unit(command))
-    command_axes.plot(record.time, record.inputs[command] / factor, color=_COMMAND, drawstyle="steps-post")
+    style = "steps-post" if record.hold == "zero" else "default"
+    command_axes.plot(record.time, record.inputs[command] / factor, color=_COMMAND, drawstyle=style)
     command_axes.set(ylabel=f"{_words(command)}\n{label}", title=record.name)
 
     series = {"measured": measured, "model": simulated}
@@ -235,4 +239,5 @@ def _prefix(largest: float, unit: str) -> str:
     """Return the prefix that leaves a number of at least 1, for units that take one."""
     if unit not in ("m", "m/s", "Pa", "N", "V", "A") or not 0.0 < largest < math.inf:
         return ""
-    return next((prefix for prefix, factor in _PREFIXES.items() if largest >= factor), "n")
+    rounded = float(f"{largest:.3g}")
+    return next((prefix for prefix, factor in _PREFIXES.items() if rounded >= factor), "n")

@@ -57,8 +57,9 @@ def write_report(
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():
         (out / f"{name}.png").write_bytes(picture)
-    table_1.to_csv(out / "table_1.csv")
-    table_2.to_csv(out / "table_2.csv")
+    for name, table in (("table_1", table_1), ("table_2", table_2)):
+        flat = table.set_axis([" ".join(column) for column in table.columns], axis="columns")
+        flat.to_csv(out / f"{name}.csv", float_format="%.6g")
     report = out / "report.html"
     report.write_text(page, encoding="utf-8")
     return report
@@ -94,7 +95,7 @@ def _beyond_noise(table: pd.DataFrame, model: Model, least: float = 10.0) -> lis
             "parameter": model.parameter(name),
             "variance": variance,
             "error": table.loc[(variance, "paper"), (name, "error %")],
-            "bound": table.loc[(variance, "Cramér-Rao bound"), (name, "error %")],
+            "bound": table.loc[(variance, paper.BOUND), (name, "error %")],
         }
         for variance in table.index.unique(0)
         for name in table.columns.unique(0)
@@ -140,7 +141,11 @@ def _percent(deviation: float) -> str:
 
 def _unit(unit: str) -> Markup:
     """Return a unit with its exponents raised."""
-    return Markup(re.sub(r"\^(-?[\d.]+)", r"<sup>\1</sup>", str(escape(unit)))) if unit else Markup("–")
+
+    def raised(exponent: re.Match[str]) -> str:
+        return f"<sup>{exponent[1].replace('-', '−')}</sup>"
+
+    return Markup(re.sub(r"\^(-?[\d.]+)", raised, str(escape(unit)))) if unit else Markup("–")
 
 
 def _symbol(symbol: str) -> Markup:

@@ -10,7 +10,9 @@ from nbclient import NotebookClient
 for path in sorted(Path(__file__).parent.glob("*.ipynb")):
     began = time.perf_counter()
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": path.parent}}).execute()
+    NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": path.parent}}
+    ).execute()
     print(f"{path.name}: ran in {time.perf_counter() - began:.0f} s", flush=True)
     if "--save" in sys.argv:
         for cell in notebook.cells:

@@ -4,6 +4,7 @@ Nothing of the package is used here. The stiff orifice equation is kept implicit
 which divides by the spool's opening: a floor under the opening keeps it finite, and its size is shown not to matter.
 """
 
+import itertools
 import math
 from typing import NamedTuple
 
@@ -46,6 +47,11 @@ class Valve(NamedTuple):
     initial_position: float = 0.0
     initial_filtered: float = 0.0
     initial_filtered_rate: float = 0.0
+
+
+def held_levels(seed, amplitude, count, samples) -> np.ndarray:
+    """The paper's pseudo random signal: `count` levels, uniform in +-amplitude, each held for `samples` samples."""
+    return np.repeat(np.random.default_rng(seed).uniform(-amplitude, amplitude, count), samples)
 
 
 def servovalve_plant(command, sample_period, *, hold="zero", method="LSODA", rtol=1e-9, floor=1e-8, **valve) -> Motion:
@@ -95,7 +101,7 @@ def _straight_pieces(command, sample_period, hold):
     else:
         apart = np.diff(command) != 0
     edges = [0, *(np.flatnonzero(apart) + 1).tolist(), len(command)]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         yield first, last, float(command[first]), float(slopes[first])
 
 

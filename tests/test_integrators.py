@@ -56,7 +56,9 @@ def test_the_same_derivative_gives_the_same_stepper():
 
 def by_matrix_exponential(damping_ratio, omega, duration, y, rate, e, e_rate):
     """y'' + 2 xi w y' + w^2 y = w^2 e with e' constant, as one linear system of y, y', e, e'."""
-    system = np.array([[0, 1, 0, 0], [-(omega**2), -2 * damping_ratio * omega, omega**2, 0], [0, 0, 0, 1], [0, 0, 0, 0]])
+    system = np.array(
+        [[0, 1, 0, 0], [-(omega**2), -2 * damping_ratio * omega, omega**2, 0], [0, 0, 0, 1], [0, 0, 0, 0]]
+    )
     return (scipy.linalg.expm(system * duration) @ [y, rate, e, e_rate])[:2]
 
 

@@ -101,9 +101,7 @@ def disturbed(name):
 
         period = jnp.asarray(record.sample_period)
         grid = grid_of(model, record)
-        return scan_model(
-            model.equations, grid, signal, model.nominal, initial, inputs, period, keep, None, None
-        )[1]
+        return scan_model(model.equations, grid, signal, model.nominal, initial, inputs, period, keep, None, None)[1]
 
     def outputs(offsets=None, shift=0.0):
         with jax.enable_x64(True):
@@ -268,8 +266,16 @@ def test_bounds_that_reach_zero_are_searched_on_a_linear_scale(lower, scale):
     [
         ({"dead_zne": (0.0, 1.0)}, {}, "expected a parameter of servovalve, got 'dead_zne'; it has dead_zone, satur"),
         ({}, {"gamma": 1.0}, "expected a parameter of servovalve, got 'gamma'; it has dead_zone"),
-        ({"mass": (1.0, 2.0)}, {"mass": 1.5}, "expected each parameter to be either bounded or fixed, got both for mass"),
-        ({"dead_zone": (2e-4, 1e-4)}, {}, r"expected finite bounds of dead_zone with lower < upper, got \(0.0002, 0.0001\)"),
+        (
+            {"mass": (1.0, 2.0)},
+            {"mass": 1.5},
+            "expected each parameter to be either bounded or fixed, got both for mass",
+        ),
+        (
+            {"dead_zone": (2e-4, 1e-4)},
+            {},
+            r"expected finite bounds of dead_zone with lower < upper, got \(0.0002, 0.0001\)",
+        ),
         ({"dead_zone": (1e-4, 1e-4)}, {}, r"to hold it at one value use fixed=\{'dead_zone': value\}"),
         ({"dead_zone": (1e-4, float("inf"))}, {}, "expected finite bounds of dead_zone"),
         ({"dead_zone": (float("nan"), 1e-4)}, {}, "expected finite bounds of dead_zone"),
@@ -282,7 +288,9 @@ def test_bounds_that_cannot_be(bounds, fixed, sentence):
 
 
 def test_an_unknown_parameter():
-    with pytest.raises(ValueError, match="expected a parameter of Van der Pol oscillator, got 'beta'; it has alpha, gam"):
+    with pytest.raises(
+        ValueError, match="expected a parameter of Van der Pol oscillator, got 'beta'; it has alpha, gam"
+    ):
         van_der_pol().parameter("beta")
 
 
@@ -344,7 +352,9 @@ def test_a_users_model_rings_down_as_the_closed_form_says():
     record = Record(0.01 * np.arange(300), {"push": np.zeros(300)})
     outputs = simulate(OSCILLATOR, record, {"B": 1.2}, {"x0": 0.1})
     decay, omega = 1.2, np.sqrt(80.0 - 1.2**2)  # B/(2M), K/M = 80
-    expected = 0.1 * np.exp(-decay * record.time) * (np.cos(omega * record.time) + decay / omega * np.sin(omega * record.time))
+    expected = (
+        0.1 * np.exp(-decay * record.time) * (np.cos(omega * record.time) + decay / omega * np.sin(omega * record.time))
+    )
     np.testing.assert_allclose(outputs["distance"], expected, rtol=0, atol=1e-8)
 
 

@@ -1,5 +1,6 @@
-"""One trajectory: what goes in, what comes out, and what is refused; the physics is tested with each model."""
+"""One trajectory: what goes in, what comes out, its gradient, and what is refused; the physics is tested elsewhere."""
 
+import functools
 import re
 
 import jax
@@ -11,6 +12,7 @@ from ehsvjax.integrators import runge_kutta_4
 from ehsvjax.models import Model, Parameter, Signal, identity, servovalve, van_der_pol
 from ehsvjax.record import Record
 from ehsvjax.simulate import grid_of, input_array, scan_model, simulate
+from tests.plants import held_levels
 
 # --- An integrator of two inputs, whose motion is known by hand: x' = k*push - pull ---
 
@@ -141,8 +143,12 @@ def test_substeps_refine_the_same_motion(substeps):
     time = 0.1 * np.arange(100)
     record = Record(time, {"command": np.zeros(100)})
     # Without damping: x1 = cos(sqrt(alpha) t), at alpha = 1, which an RK4 step gives to h^5/120.
-    outputs = simulate(van_der_pol(), record, {"alpha": 1.0, "gamma": 0.0}, {"initial_position": 1.0}, substeps=substeps)
-    np.testing.assert_allclose(outputs["position"], np.cos(time), rtol=0, atol=1.1 * 100 * (0.1 / substeps) ** 5 * substeps / 120)
+    outputs = simulate(
+        van_der_pol(), record, {"alpha": 1.0, "gamma": 0.0}, {"initial_position": 1.0}, substeps=substeps
+    )
+    np.testing.assert_allclose(
+        outputs["position"], np.cos(time), rtol=0, atol=1.1 * 100 * (0.1 / substeps) ** 5 * substeps / 120
+    )
 
 
 # --- Compiling ---
@@ -191,6 +197,78 @@ def test_the_scan_visits_outputs_and_samples_in_the_precision_of_its_inputs(prec
         assert frames.dtype == total.dtype == precision
         np.testing.assert_allclose(frames, [5.0, 5.2, 5.8], rtol=1e-6)
         np.testing.assert_allclose(total, 5.0 + 52.0 + 580.0, rtol=1e-6)
+
+
+# --- Gradients, through the servovalve with its dead zone, saturation and lock ---
+
+
+def valve_record(command):
+    return Record(1e-3 * np.arange(len(command)), {"command": command})
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def positions(equations, grid, parameters, initial, inputs):
+    def keep(carry, outputs, sample):
+        return carry, outputs["position"]
+
+    return scan_model(equations, grid, identity, parameters, initial, inputs, jnp.asarray(1e-3), keep, None, None)[1]
+
+
+def jacobian(record, initial):
+    """Derivatives of the position [time] by every free parameter and initial condition, by name."""
+    model = servovalve()
+    start = {p.name: p.value for p in model.initial} | initial
+    constants = {p.name: p.value for p in model.parameters if p.fixed}
+    with jax.enable_x64(True):
+        inputs, grid = jnp.asarray(input_array(model, record)), grid_of(model, record)
+
+        def run(unknown):
+            return positions(model.equations, grid, constants | unknown, unknown, inputs)
+
+        unknown = {name: model.nominal[name] for name in model.free} | start
+        return {name: np.asarray(column) for name, column in jax.jacfwd(run)(unknown).items()}
+
+
+def test_gradients_against_central_differences():
+    model, record = servovalve(), valve_record(held_levels(3, 6e-3, 2, 150))
+    initial = {"initial_position": 0.01, "initial_filtered": 1e-4, "initial_filtered_rate": 0.1}
+    steps = {name: 1e-6 * value for name, value in (model.nominal | initial).items() if name in (*model.free, *initial)}
+    columns = jacobian(record, initial)
+    assert set(columns) == set(steps)
+    for name, step in steps.items():
+        ahead, behind = (
+            simulate(
+                model,
+                record,
+                {name: model.nominal[name] + way * step} if name in model.nominal else {},
+                initial | ({name: initial[name] + way * step} if name in initial else {}),
+            )["position"]
+            for way in (1, -1)
+        )
+        expected = (ahead - behind) / (2 * step)
+        np.testing.assert_allclose(columns[name], expected, rtol=0, atol=1e-4 * np.abs(expected).max(), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("command", "initial"),
+    [
+        (np.zeros(300), {}),  # at rest
+        (np.full(300, 0.09 * 0.05 + 0.5e-4), {"initial_position": 0.05, "initial_filtered": 0.5e-4}),  # lock
+        (np.full(300, 0.0045 + 1e-4), {"initial_position": 0.05, "initial_filtered": 1e-4}),  # opens just now
+        (np.full(300, 0.0045 + 3.1e-3), {"initial_position": 0.05, "initial_filtered": 3.1e-3}),  # saturates just now
+    ],
+)
+def test_gradients_are_finite_where_the_valve_has_a_corner(command, initial):
+    for name, column in jacobian(valve_record(command), initial).items():
+        assert np.isfinite(column).all(), name
+
+
+def test_in_lock_only_the_initial_position_moves_the_position():
+    initial = {"initial_position": 0.05, "initial_filtered": 0.5e-4}
+    columns = jacobian(valve_record(np.full(300, 0.09 * 0.05 + 0.5e-4)), initial)
+    np.testing.assert_array_equal(columns.pop("initial_position"), 1.0)
+    for name, column in columns.items():
+        np.testing.assert_array_equal(column, 0.0, err_msg=name)
 
 
 # --- Bad input ---

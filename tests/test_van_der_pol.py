@@ -6,7 +6,7 @@ import pytest
 from ehsvjax.models import van_der_pol
 from ehsvjax.record import Record
 from ehsvjax.simulate import simulate
-from tests.plants import van_der_pol_plant
+from tests.plants import held_levels, van_der_pol_plant
 
 
 def record_of(command, period):
@@ -14,8 +14,8 @@ def record_of(command, period):
 
 
 def staircase(seed, period):
-    """Uniform random levels in +-2, held 1 s, for 40 s."""
-    return np.repeat(np.random.default_rng(seed).uniform(-2.0, 2.0, 40), round(1.0 / period))
+    """Levels in +-2, held 1 s, for 40 s."""
+    return held_levels(seed, 2.0, 40, round(1.0 / period))
 
 
 @pytest.mark.parametrize("period", [0.02, 0.1])

@@ -1,0 +1,124 @@
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import pytest
+
+from ehsvjax.summary import summary, summary_html
+from tests import hand_made
+
+# rmse: three errors of 0.1. fit: 100*(1 - sqrt(0.03/18.96)), 18.96 = 2.6^2 + 0.8^2 + 3.4^2 about the mean 5.2.
+# cost: 0.03 N^2 times the period of 0.5 s.
+SUMMARY = """\
+[[Model]]
+    name     amplifier
+    signals  command -> force, strain
+    options  coupling='dc'
+[[Record]]
+    name     samples  missing     period  duration
+    bench 7  4        1 of force  0.5 s   1.5 s
+[[Fit statistics]]
+    method              genetic algorithm, 10 individuals x 3 generations = 30 simulations
+    refinement          7 steps by gradient, converged; 3 of 4 starts led to this minimum
+    samples             3 measured
+    unknowns            1 parameters, and the initial conditions that are estimated
+    cost, equation (9)  0.015 N^2 s
+[[Outputs]]
+    output  rmse         fit      noise standard deviation
+    force   1.000e-01 N  96.02 %  1.000e-01 N
+[[Parameters]]
+    name         symbol  value  unit  bounds
+    gain         k       2      N/V   0.5 .. 5
+    temperature  T       293    K     (fixed)
+[[Initial conditions]]
+    name          symbol  value  unit
+    initial_load  F(0)    0.5    N
+[[Warnings]]
+    none"""
+
+
+class Page(HTMLParser):
+    """Collects tags, attributes and the texts of cells and titles."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tags, self.attributes, self.texts = [], [], []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [name for name, _ in attrs]
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def test_text_is_what_a_pencil_gives():
+    assert summary(hand_made.fit()) == SUMMARY
+
+
+def test_a_fit_prints_its_summary():
+    fit = hand_made.fit()
+    assert str(fit) == repr(fit) == SUMMARY
+    assert fit._repr_html_() == summary_html(fit)
+
+
+def test_several_outputs_are_listed_and_their_costs_weighed():
+    # Force: 0.03*0.5/0.01; strain: four errors of 1e-4, 4e-8*0.5/1e-8.
+    text = summary(hand_made.fit(hand_made.record_of_both()))
+    assert "3.5 s (each output over its noise variance)" in text
+    assert "    force   1.000e-01 N    96.02 %  1.000e-01 N\n" in text
+    assert "    strain  1.000e-04 m/m  95.53 %  1.000e-04 m/m\n" in text
+
+
+@pytest.mark.parametrize(("unit", "shown"), [("N", "N^2 s"), ("", "s"), ("m/m", "(m/m)^2 s")])
+def test_cost_carries_its_unit(unit, shown):
+    model = hand_made.amplifier()
+    signals = tuple(s._replace(unit=unit) if s.name == "force" else s for s in model.signals)
+    text = summary(hand_made.fit(model=replace(model, signals=signals)))
+    assert f"    cost, equation (9)  0.015 {shown}\n" in text
+
+
+def test_each_record_has_its_own_initial_conditions():
+    records = hand_made.record("first"), hand_made.record("second")
+    fit = hand_made.fit(*records, initial=({"initial_load": 0.25}, {"initial_load": 0.75}))
+    text = summary(fit)
+    assert "[[Records]]" in text
+    assert "    name          symbol  first  second  unit\n    initial_load  F(0)    0.25   0.75    N\n" in text
+    assert "    samples             6 measured\n" in text
+
+
+def test_effort_is_told_as_it_was():
+    fit = hand_made.fit()
+    effort = fit.effort._replace(refined=False, stopped_early=True)
+    text = summary(replace(fit, effort=effort, huber=1.345))
+    assert "10 individuals x 3 generations = 30 simulations; ended by its stop test\n" in text
+    assert "    refinement          none\n" in text
+    assert "    residuals           weighed linearly beyond 1.345 standard deviations (Huber)\n" in text
+    unconverged = summary(replace(fit, effort=fit.effort._replace(converged=False)))
+    assert "7 steps by gradient, not converged; 3 of 4" in unconverged
+
+
+def test_warnings_stand_one_below_the_other():
+    text = summary(hand_made.fit(warnings=("gain is at its upper bound", "not refined")))
+    assert text.endswith("[[Warnings]]\n    gain is at its upper bound\n    not refined")
+
+
+def test_html_tells_the_same_as_the_text():
+    fit = hand_made.fit(hand_made.record_of_both())
+    text = summary(fit)
+    texts = Page(summary_html(fit)).texts
+    assert all(part in text for part in texts)
+    assert "".join("".join(texts).split()) == "".join(text.replace("[[", "").replace("]]", "").split())
+
+
+def test_html_escapes_what_users_write():
+    hostile = '<script>alert("1")</script>&amp;'
+    model = hand_made.amplifier()
+    parameters = (model.parameters[0]._replace(symbol="<b>k</b>", unit="<i>"), *model.parameters[1:])
+    fit = hand_made.fit(
+        hand_made.record(hostile), model=replace(model, parameters=parameters, name="<h1>"), warnings=("a < b",)
+    )
+    page = Page(summary_html(fit))
+    assert set(page.tags) <= {"div", "p", "b", "table", "tr", "th", "td"}
+    assert set(page.attributes) <= {"style"}
+    assert {hostile, "<b>k</b>", "<i>", "<h1>", "a < b"} <= set(page.texts)
