@@ -124,9 +124,7 @@ def _number(value: float, digits: int = 4) -> Markup:
     power = str(int(exponent)).replace("-", "−")
     mantissa = mantissa.rstrip("0").rstrip(".").replace("-", "−")
     return (
-        Markup(f"10<sup>{power}</sup>")
-        if mantissa == "1"
-        else Markup(f"{mantissa}&thinsp;×&thinsp;10<sup>{power}</sup>")
+        Markup(f"10<sup>{power}</sup>") if mantissa == "1" else Markup(f"{mantissa}&#8239;×&#8239;10<sup>{power}</sup>")
     )
 
 

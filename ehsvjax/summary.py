@@ -67,13 +67,13 @@ def _record_row(record: Record) -> tuple[str, ...]:
 
 
 def _statistics_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
-    effort = fit.effort
+    effort, count = fit.effort, len(fit.parameters)
     samples = sum(int(np.isfinite(y).sum()) for record in fit.records for y in record.outputs.values())
     rows = [
         ("method", f"genetic algorithm, {_search(effort)}"),
         ("refinement", _refinement(effort)),
         ("samples", f"{samples} measured"),
-        ("unknowns", f"{len(fit.parameters)} parameters, and the initial conditions that are estimated"),
+        ("unknowns", f"{count} parameter{'s' if count > 1 else ''}, and the initial conditions that are estimated"),
         ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}"),
     ]
     if fit.huber is not None:

@@ -188,7 +188,7 @@ def test_demo_writes_what_it_says(oscillator, valve, monkeypatch, tmp_path, caps
     assert not any(outside in page for outside in ("http", "<script", "<link", "@import"))
     for told in (
         "10<sup>−5</sup> as the real one",
-        "1.41&thinsp;×&thinsp;10<sup>−4</sup>",
+        "1.41&#8239;×&#8239;10<sup>−4</sup>",
         "Equation (3)",
         "Initial state",
     ):
@@ -209,8 +209,8 @@ def test_report_wants_both_models(tmp_path, valve):
         (0.72, "0.72"),
         (-327.6, "−327.6"),
         (1e-5, "10<sup>−5</sup>"),
-        (9.92e-5, "9.92&thinsp;×&thinsp;10<sup>−5</sup>"),
-        (-2e7, "−2&thinsp;×&thinsp;10<sup>7</sup>"),
+        (9.92e-5, "9.92&#8239;×&#8239;10<sup>−5</sup>"),
+        (-2e7, "−2&#8239;×&#8239;10<sup>7</sup>"),
     ],
 )
 def test_numbers_are_written_as_people_do(value, shown):

@@ -20,7 +20,7 @@ SUMMARY = """\
     method              genetic algorithm, 10 individuals x 3 generations = 30 simulations
     refinement          7 steps by gradient, converged; 3 of 4 starts led to this minimum
     samples             3 measured
-    unknowns            1 parameters, and the initial conditions that are estimated
+    unknowns            1 parameter, and the initial conditions that are estimated
     cost, equation (9)  0.015 N^2 s
 [[Outputs]]
     output  rmse         fit      noise standard deviation

@@ -1,0 +1,48 @@
+"""A real servovalve in open loop, where its records are at hand: fit one run, predict another and other voltages."""
+
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+
+FOLDER = Path(os.environ.get("EHSVJAX_DATA", Path(__file__).parents[2] / "shared" / "data")) / "festo"
+pytestmark = pytest.mark.skipif(not FOLDER.exists(), reason="the measured records are not at hand")
+
+SETTINGS = {
+    "population": 20,
+    "generations": 10,
+    "starts": 1,
+    "huber": 1.345,
+    "bounds": {"flow_gain": (5e-6, 5e-4), "damping_ratio": (0.3, 3.0), "natural_frequency": (10.0, 1000.0)},
+    "fixed": {"dead_zone": 0.0, "saturation": 1e-3},
+    "initial": {"initial_filtered": 0.0, "initial_filtered_rate": 0.0},
+}
+
+
+def _stroke_out(name):
+    """The stroke out from rest until the piston is about to meet the end of the sensor, 1 V as 0.1 mm and 20 mm."""
+    record = ehsvjax.Record.from_csv(
+        FOLDER / f"{name}.csv",
+        time="t_s",
+        inputs={"command": ehsvjax.Column("valve_cmd_V", scale=1e-4)},
+        outputs={"position": ehsvjax.Column("position_raw_V", scale=0.02)},
+    )
+    return record.slice(0.0, record.time[np.flatnonzero(record.outputs["position"] > 0.195)[0]])
+
+
+def test_one_run_predicts_a_repeat_and_other_voltages():
+    piston, rod = np.pi / 4 * 0.016**2, np.pi / 4 * 0.010**2
+    model = ehsvjax.servovalve(
+        open_loop=True, piston_area=piston - rod / 2, supply_pressure=4.35e6, mass=1.0, stiffness=0.0
+    )
+    fit = ehsvjax.identify(model, _stroke_out("pA_3V_s01"), key=jax.random.key(0), **SETTINGS)
+    assert fit.fit_percent["position"] > 97.0
+    # The stroke takes 0.155 m/s at 3 V, as a straight line through the measured positions shows.
+    slope = fit.parameters["flow_gain"] * 3e-4 * np.sqrt(4.35e6) / model.nominal["piston_area"]
+    assert slope == pytest.approx(0.155, rel=0.03)
+    for name, least in (("pA_3V_s02", 96.0), ("pA_2V_s01", 94.0), ("pA_4V_s01", 94.0)):
+        assert fit.score(_stroke_out(name)).fit_percent["position"] > least, name
