@@ -188,6 +188,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=200)
     parser.add_argument("--model", choices=["van_der_pol", "servovalve", "both"], default="both")
+    parser.add_argument("--variances", type=float, nargs="*", help="some of the paper's only")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
@@ -196,9 +197,15 @@ def main() -> None:
         if options.model not in (make.__name__, "both"):
             continue
         experiment = make()
-        results = [measure(experiment, variance, options.draws, options.seed) for variance in experiment.paper]
-        facts = [fact for _, fact in results]
-        table = pd.concat([table for table, _ in results], ignore_index=True)
+        stem = options.out / f"monte_carlo_{make.__name__}"
+        tables, facts = [], []
+        for variance in options.variances or experiment.paper:
+            rows, fact = measure(experiment, variance, options.draws, options.seed)
+            tables.append(rows)
+            facts.append(fact)
+            # What has been measured is kept, even if the rest is interrupted.
+            stem.with_suffix(".json").write_text(json.dumps(facts))
+        table = pd.concat(tables, ignore_index=True)
         print(f"\n{experiment.model.name}: {options.draws} draws, seed {options.seed}, population "
               f"{experiment.population}, {experiment.generations} generations")  # fmt: skip
         print(table.to_string(index=False, float_format=lambda v: f"{v:.3g}"))
@@ -206,8 +213,6 @@ def main() -> None:
             print(f"variance {fact['variance']:g}: {fact['lost']} of {fact['draws']} draws lost, {fact['unconverged']} "
                   f"not converged, {fact['median seconds per identification']:.2f} s each (median)")  # fmt: skip
         print(f"Sampling error of each ratio: {100 / np.sqrt(2 * options.draws):.1f}% (one standard deviation).")
-        stem = options.out / f"monte_carlo_{make.__name__}"
-        stem.with_suffix(".json").write_text(json.dumps(facts))
         table.to_csv(stem.with_suffix(".csv"), index=False)
         picture(experiment, facts).savefig(stem.with_suffix(".png"), dpi=120)
 

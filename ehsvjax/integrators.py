@@ -77,7 +77,7 @@ def second_order_filter(damping_ratio, natural_frequency, duration) -> LinearFil
 
     exp(Ah) = exp(-s) [C(D) I + S(D) (Ah + s I)], s = xi w h, D = (xi^2 - 1) w^2 h^2, with the entire functions
     C(D) = cosh(sqrt(D)) and S(D) = sinh(sqrt(D))/sqrt(D): one series for the under- and the overdamped case,
-    differentiable through critical damping. Twelve terms keep float64 exact to 1e-12 up to w h = 3.
+    differentiable through critical damping. Twelve terms keep float64 exact to 1e-11 where |xi^2 - 1| (w h)^2 < 9.
 
     Args:
         damping_ratio: xi, dimensionless.

@@ -3,6 +3,7 @@
 import functools
 import math
 from collections.abc import Callable, Mapping
+from numbers import Integral
 from typing import Any, NamedTuple
 
 import jax
@@ -54,11 +55,8 @@ def simulate(
         ValueError: for an unknown parameter, an input that the record lacks, or substeps below 1.
 
     """
-    parameters, initial = dict(parameters or {}), dict(initial or {})
-    for name in (*parameters, *initial):
-        model.parameter(name)
-    values = model.nominal | parameters
-    start = {p.name: p.value for p in model.initial} | initial
+    values = _changed(model, "parameters", model.nominal, parameters)
+    start = _changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
     grid = grid_of(model, record, substeps)
     inputs = input_array(model, record)
     with jax.enable_x64(True):
@@ -75,6 +73,17 @@ def simulate(
     return {name: np.asarray(outputs[name]) for name in model.outputs}
 
 
+def _changed(
+    model: Model, kind: str, nominal: Mapping[str, float], changes: Mapping[str, float] | None
+) -> dict[str, float]:
+    for name in changes or {}:
+        model.parameter(name)
+        if name not in nominal:
+            known = ", ".join(nominal) or "none"
+            raise ValueError(f"expected one of the {kind} of {model.name} here, got {name!r}; they are {known}")
+    return {**nominal, **(changes or {})}
+
+
 def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
     """Return the steps per sample that the model's `max_step` asks for, with the record's hold.
 
@@ -85,9 +94,9 @@ def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
     if substeps is None:
         # A period that equals max_step but for rounding is one step.
         substeps = max(1, math.ceil(record.sample_period / model.max_step * (1.0 - 1e-3)))
-    if not (isinstance(substeps, int) and substeps >= 1):
+    if isinstance(substeps, bool) or not isinstance(substeps, Integral) or substeps < 1:
         raise ValueError(f"expected substeps to be a whole number of at least 1, got {substeps!r}")
-    return Grid(substeps, record.hold)
+    return Grid(int(substeps), record.hold)
 
 
 def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]:

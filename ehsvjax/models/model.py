@@ -169,7 +169,7 @@ class Model:
 
         def changed(p: Parameter) -> Parameter:
             if p.name in bounds:
-                lower, upper = (float(b) for b in bounds[p.name])
+                lower, upper = _pair(p.name, bounds[p.name])
                 value = min(max(p.value, lower), upper)
                 # A search over both signs cannot be logarithmic.
                 scale = p.scale if lower > 0 else "linear"
@@ -186,6 +186,14 @@ class Model:
         )
 
 
+def _pair(name: str, bounds: Any) -> tuple[float, float]:
+    try:
+        lower, upper = bounds
+        return float(lower), float(upper)
+    except (TypeError, ValueError):
+        raise ValueError(f"expected bounds of {name} as (lower, upper), got {bounds!r}") from None
+
+
 def check_bounds(parameter: Parameter) -> None:
     """Refuse bounds out of order, a value outside them, and a log scale that reaches zero.
 
@@ -194,6 +202,8 @@ def check_bounds(parameter: Parameter) -> None:
 
     """
     name, value, lower, upper = parameter.name, parameter.value, parameter.lower, parameter.upper
+    if parameter.scale not in ("linear", "log"):
+        raise ValueError(f"expected the scale of {name} to be 'linear' or 'log', got {parameter.scale!r}")
     if not abs(value) < float("inf"):
         raise ValueError(f"expected a finite value for {name}, got {value}")
     if parameter.fixed:

@@ -244,7 +244,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
 
     def measure(parameters, state, inputs, signal):
         del parameters
-        spool = spool_of(inputs["command"], state.filtered, signal)
+        spool = spool_of(signal("command", inputs["command"]), state.filtered, signal)
         return {
             "position": signal("position", state.position, velocity=state.velocity),
             "spool": signal("spool", spool),
@@ -275,7 +275,10 @@ def _load_stage(parameters, h):
         direction = jnp.where(opening < 0.0, -1.0, 1.0)
         half_slope = 0.5 * parameters["flow_gain"] * jnp.abs(opening) / flow_by_pressure
         drop = supply + direction * flow_at_rest / flow_by_pressure
-        root = drop / (half_slope + jnp.sqrt(half_slope * half_slope + jnp.abs(drop)))
+        square = half_slope * half_slope + jnp.abs(drop)
+        # Closed, and just balanced by the load: no flow, and no derivative of a root of zero.
+        flowing = square > 0.0
+        root = jnp.where(flowing, drop / (half_slope + jnp.sqrt(jnp.where(flowing, square, 1.0))), 0.0)
         flow = parameters["flow_gain"] * opening * root
         pressure_end = (flow - flow_at_rest) / flow_by_pressure
         velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) / area

@@ -38,7 +38,8 @@ def van_der_pol(alpha: float = 0.96, gamma: float = 1.23) -> Model:
         start=_start,
         stepper=runge_kutta_4(_derivative),
         measure=_measure,
-        max_step=0.025,
+        # Runge-Kutta steps that keep a forced record of 40 s within 1e-6; 0.02 s leaves up to 1.2e-5.
+        max_step=0.005,
         options=(("alpha", alpha), ("gamma", gamma)),
     )
 
