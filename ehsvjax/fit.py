@@ -90,6 +90,7 @@ class Fit:
         effort: what was done.
         warnings: what a user should know before trusting the numbers; empty if nothing.
         huber: residuals beyond this many standard deviations weigh linearly; None: all are squared.
+        estimated_initial: names of the initial conditions that were estimated; the others were known.
 
     """
 
@@ -102,6 +103,7 @@ class Fit:
     effort: Effort
     warnings: tuple[str, ...]
     huber: float | None = None
+    estimated_initial: tuple[str, ...] = ()
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -137,7 +139,8 @@ class Fit:
         Args:
             record: one that was fitted, or a new one.
             initial: for a record that was fitted, its own initial conditions; for a new one they are first
-                "estimate"d from its outputs with the parameters held, or taken as "nominal", or given by name.
+                "estimate"d from its outputs with the parameters held (but for those that were known alike for every
+                record of the fit), or taken as "nominal", or given by name.
 
         Returns:
             every output of the model by name, `[time]`, SI.

@@ -124,7 +124,15 @@ def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
     known = replace(fit.model, parameters=tuple(p._replace(fixed=True) for p in fit.model.parameters))
     known = known.with_bounds(fixed=fit.parameters)
     variance = {name: v for name, v in fit.noise_variance.items() if name in record.outputs}
-    problem = problem_of(known, [record], noise_variance=variance, huber=fit.huber)
+    first, *others = fit.initial
+    given = {
+        name: value
+        for name, value in first.items()
+        if name not in fit.estimated_initial and all(other[name] == value for other in others)
+    }
+    if len(given) == len(first):
+        return given
+    problem = problem_of(known, [record], initial=given, noise_variance=variance, huber=fit.huber)
     middle = np.full(problem.unknowns, 0.5)
     starts = np.stack([middle, _with_nominal_initial(problem, known, middle)])
     refined, _, problem = _refine_and_reweigh(problem, starts, reweigh=False)
@@ -264,6 +272,7 @@ def _fit(model, records, problem: Problem, individual, history: genetic.History,
         effort=effort,
         warnings=_warnings(model, problem, individual, effort),
         huber=problem.huber,
+        estimated_initial=problem.free_initial,
     )
 
 

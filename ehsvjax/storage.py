@@ -34,6 +34,7 @@ def save_fit(fit: Fit, path: str | os.PathLike) -> None:
         "effort": fit.effort._asdict(),
         "warnings": fit.warnings,
         "huber": fit.huber,
+        "estimated_initial": fit.estimated_initial,
     }
     # An open file keeps the name as given: numpy would append .npz to a path.
     with open(path, "wb") as file:
@@ -78,6 +79,7 @@ def load_fit(path: str | os.PathLike, model: Model | None = None) -> Fit:
         effort=Effort(**facts["effort"]),
         warnings=tuple(facts["warnings"]),
         huber=facts["huber"],
+        estimated_initial=tuple(facts["estimated_initial"]),
     )
 
 

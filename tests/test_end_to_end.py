@@ -320,3 +320,14 @@ def test_bad_records_are_answered(record):
     without_input = ehsvjax.Record(record.time, {}, record.outputs)
     with pytest.raises(ValueError, match="it lacks command"):
         _identified(without_input)
+
+
+def test_initial_conditions_that_were_known_stay_known_for_another_record(record):
+    fit = _identified(record, initial={"initial_velocity": -0.2})
+    assert fit.estimated_initial == ("initial_position",)
+    other = _oscillator(seed=9, initial=(1.0, -0.2))
+    given = {"initial_position": 1.0, "initial_velocity": -0.2}
+    assert fit.score(other).rmse["position"] <= fit.score(other, initial=given).rmse["position"]
+    started = fit.simulate(other)["position"][:2]
+    # The first step shows the velocity: x1' = alpha*x2.
+    assert (started[1] - started[0]) / PERIOD == pytest.approx(-0.2, abs=0.1)
