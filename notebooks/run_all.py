@@ -1,4 +1,4 @@
-"""Run every notebook top to bottom, as CI does; their committed outputs are left alone unless --save is given."""
+"""Run every notebook top to bottom, as CI does, or those named; committed outputs stay unless --save is given."""
 
 import sys
 import time
@@ -7,7 +7,8 @@ from pathlib import Path
 import nbformat
 from nbclient import NotebookClient
 
-for path in sorted(Path(__file__).parent.glob("*.ipynb")):
+chosen = [a for a in sys.argv[1:] if not a.startswith("-")] or ["*.ipynb"]
+for path in sorted(p for pattern in chosen for p in Path(__file__).parent.glob(pattern)):
     began = time.perf_counter()
     notebook = nbformat.read(path, as_version=4)
     NotebookClient(
