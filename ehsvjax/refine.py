@@ -130,7 +130,9 @@ def refine(
     """
     optimizer = optax.with_extra_args_support(levenberg_marquardt() if optimizer is None else optimizer)
 
-    def value_fn(params):
+    def value_fn(params, information=None):
+        # optax hands a line search's function those extra arguments that it names.
+        del information
         return 0.5 * population_cost(problem, params[None])[0]
 
     def refine_one(start):
@@ -160,7 +162,8 @@ def refine(
             step = gauss_newton_step(best.individual, gradient_at_best, best.information, damping)
             remaining = -jnp.dot(gradient_at_best, step)
             enough = tolerance * best.cost / jnp.sum(problem.samples.measured)
-            best = best._replace(remaining=remaining, iterations=k + 1, converged=remaining <= enough)
+            converged = (remaining <= enough) & jnp.isfinite(best.cost)
+            best = best._replace(remaining=remaining, iterations=k + 1, converged=converged)
             return moved, optimizer_state, best, gradient_at_best, k + 1
 
         size = start.shape[0]
