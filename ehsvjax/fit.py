@@ -1,5 +1,6 @@
 """The result of an identification: parameters, how well they fit, and what can be asked of them next."""
 
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -149,7 +150,7 @@ class Fit:
             ValueError: if the record lacks an input, or has no output to estimate initial conditions from.
 
         """
-        return simulate(self.model, record, self.parameters, self._initial_of(record, initial))
+        return simulate(self.model, record, self.parameters, self.initial_of(record, initial))
 
     def residuals(
         self, record: Record | None = None, initial: Mapping[str, float] | str = "estimate"
@@ -169,11 +170,23 @@ class Fit:
         """Judge the prediction of one record, fitted or new; arguments as for `simulate`."""
         return _score([record], [self.residuals(record, initial)])
 
-    @property
+    @functools.cached_property
     def _score(self) -> Score:
         return _score(self.records, [self.residuals(record) for record in self.records])
 
-    def _initial_of(self, record: Record, initial) -> dict[str, float]:
+    def initial_of(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> dict[str, float]:
+        """Return the initial conditions, name -> value, with which `simulate` starts; arguments as there.
+
+        Estimating those of a new record is a small fit of its own: give the result back as `initial` to do it once.
+
+        Raises:
+            ValueError: as `simulate` does.
+
+        """
+        for name in initial if not isinstance(initial, str) else ():
+            if name not in {p.name for p in self.model.initial}:
+                known = ", ".join(p.name for p in self.model.initial) or "none"
+                raise ValueError(f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}")
         nominal = {p.name: p.value for p in self.model.initial}
         if not isinstance(initial, str):
             return nominal | dict(initial)

@@ -52,8 +52,8 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     """
     if not record.outputs:
         raise ValueError(f"expected {record.name} to hold an output to draw, got none: use fit.simulate(record)")
-    simulated = fit.simulate(record)
-    score = fit.score(record)
+    initial = fit.initial_of(record)
+    simulated, score = fit.simulate(record, initial), fit.score(record, initial)
     count = len(record.outputs)
     with _style():
         figure = _figure(width=9.0, height=3.4 * count + 2.2)

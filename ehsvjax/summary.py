@@ -67,18 +67,27 @@ def _record_row(record: Record) -> tuple[str, ...]:
 
 
 def _statistics_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
-    effort, count = fit.effort, len(fit.parameters)
+    effort = fit.effort
     samples = sum(int(np.isfinite(y).sum()) for record in fit.records for y in record.outputs.values())
     rows = [
         ("method", f"genetic algorithm, {_search(effort)}"),
         ("refinement", _refinement(effort)),
         ("samples", f"{samples} measured"),
-        ("unknowns", f"{count} parameter{'s' if count > 1 else ''}, and the initial conditions that are estimated"),
+        ("unknowns", _unknowns(fit)),
         ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}"),
     ]
     if fit.huber is not None:
         rows.insert(2, ("residuals", f"weighed linearly beyond {fit.huber:g} standard deviations (Huber)"))
     return rows
+
+
+def _unknowns(fit: Fit) -> str:
+    parameters, initial, records = len(fit.parameters), len(fit.estimated_initial), len(fit.records)
+    words = f"{parameters} parameter{'s' if parameters > 1 else ''}"
+    if initial:
+        words += f", {initial} initial condition{'s' if initial > 1 else ''}"
+        words += f" of each of {records} records" if records > 1 else ""
+    return words
 
 
 def _search(effort: Effort) -> str:

@@ -230,6 +230,12 @@ def test_another_record_is_predicted(fit):
     other = _oscillator(seed=9, initial=(1.0, 0.0))
     assert fit.score(other).rmse["position"] == pytest.approx(0.05**0.5, rel=0.15)
     assert fit.score(other, initial="nominal").rmse["position"] > fit.score(other).rmse["position"]
+    estimated = fit.initial_of(other)
+    assert estimated["initial_position"] == pytest.approx(1.0, abs=0.5)
+    assert fit.score(other, estimated) == fit.score(other)
+    assert fit.initial_of(fit.records[0]) == fit.initial[0]
+    with pytest.raises(ValueError, match="expected an initial condition of Van der Pol oscillator, got 'alpha'; it"):
+        fit.initial_of(other, {"alpha": 1.0})
 
 
 SCRIPT = """

@@ -280,6 +280,7 @@ def test_bounds_that_reach_zero_are_searched_on_a_linear_scale(lower, scale):
         ({"dead_zone": (1e-4, float("inf"))}, {}, "expected finite bounds of dead_zone"),
         ({"dead_zone": (float("nan"), 1e-4)}, {}, "expected finite bounds of dead_zone"),
         ({}, {"dead_zone": float("nan")}, "expected a finite value for dead_zone, got nan"),
+        ({}, {"mass": -1.0}, "expected a positive value for mass, or zero, got -1.0: mind the sign"),
     ],
 )
 def test_bounds_that_cannot_be(bounds, fixed, sentence):
@@ -323,6 +324,10 @@ def test_an_unknown_parameter():
         (
             {"parameters": (Parameter("K", "K", "N/m", 1.0, 2.0, 0.0),)},
             r"expected finite bounds of K with lower < upper, got \(2.0, 0.0\)",
+        ),
+        (
+            {"initial": (Parameter("x0", "x(0)", "m", 0.0, -1.0, 1.0, output="push"),)},
+            "expected the output that shows x0 of oscillator to be a signal of kind 'sensor', distance, spring_force; got 'push'",
         ),
         ({"max_step": 0.0}, "expected max_step of oscillator to be positive seconds, got 0.0"),
         ({"max_step": float("nan")}, "expected max_step of oscillator to be positive seconds, got nan"),

@@ -20,7 +20,7 @@ SUMMARY = """\
     method              genetic algorithm, 10 individuals x 3 generations = 30 simulations
     refinement          7 steps by gradient, converged; 3 of 4 starts led to this minimum
     samples             3 measured
-    unknowns            1 parameter, and the initial conditions that are estimated
+    unknowns            1 parameter
     cost, equation (9)  0.015 N^2 s
 [[Outputs]]
     output  rmse         fit      noise standard deviation
@@ -85,6 +85,8 @@ def test_each_record_has_its_own_initial_conditions():
     assert "[[Records]]" in text
     assert "    name          symbol  first  second  unit\n    initial_load  F(0)    0.25   0.75    N\n" in text
     assert "    samples             6 measured\n" in text
+    estimated = summary(replace(fit, estimated_initial=("initial_load",)))
+    assert "    unknowns            1 parameter, 1 initial condition of each of 2 records\n" in estimated
 
 
 def test_effort_is_told_as_it_was():

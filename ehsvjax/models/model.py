@@ -77,7 +77,8 @@ class Model:
 
     Raises:
         ValueError: for names that repeat, bounds that are not in order, a value outside its bounds, a log scale with a
-            bound that is not positive, or a model without an output.
+            bound that is not positive or a negative value, an initial condition shown by an output that there is not,
+            or a model without an output.
 
     """
 
@@ -99,10 +100,15 @@ class Model:
             repeated = {n for n in found if found.count(n) > 1}
             if repeated:
                 raise ValueError(f"expected every {kind} of {self.name} to have its own name, got {repeated} twice")
-        for parameter in (*self.parameters, *self.initial):
-            check_bounds(parameter)
         if not self.outputs:
             raise ValueError(f"expected {self.name} to have an output, got no signal of kind 'sensor'")
+        for parameter in (*self.parameters, *self.initial):
+            check_bounds(parameter)
+            if parameter.output is not None and parameter.output not in self.outputs:
+                raise ValueError(
+                    f"expected the output that shows {parameter.name} of {self.name} to be a signal of kind 'sensor', "
+                    f"{', '.join(self.outputs)}; got {parameter.output!r}"
+                )
         if not self.max_step > 0:
             raise ValueError(f"expected max_step of {self.name} to be positive seconds, got {self.max_step}")
 
@@ -206,6 +212,8 @@ def check_bounds(parameter: Parameter) -> None:
         raise ValueError(f"expected the scale of {name} to be 'linear' or 'log', got {parameter.scale!r}")
     if not abs(value) < float("inf"):
         raise ValueError(f"expected a finite value for {name}, got {value}")
+    if parameter.scale == "log" and value < 0:
+        raise ValueError(f"expected a positive value for {name}, or zero, got {value}: mind the sign")
     if parameter.fixed:
         return
     if not (abs(lower) < float("inf") and abs(upper) < float("inf") and lower < upper):
