@@ -123,7 +123,15 @@ def repeated(step: Callable, count: int) -> Callable:
     return lambda state, inputs: lax.fori_loop(0, count, lambda k, state: part(k, state, inputs), state)
 
 
-def scan_samples(step: Callable, state: Any, visit: Callable, carry: Any, samples: Any, inputs_of: Callable):
+def scan_samples(
+    step: Callable,
+    state: Any,
+    visit: Callable,
+    carry: Any,
+    samples: Any,
+    inputs_of: Callable,
+    scan: Callable = lax.scan,
+):
     """Visit samples 0..n-1 of a trajectory, moving one sample period after each: frames are those before the step.
 
     Args:
@@ -133,6 +141,7 @@ def scan_samples(step: Callable, state: Any, visit: Callable, carry: Any, sample
         carry: what `visit` accumulates.
         samples: pytree of arrays `[time, ...]`, one slice per sample.
         inputs_of: `(sample) -> inputs`, the function of the fraction of the period that `step` takes.
+        scan: `lax.scan`, or what does the same.
 
     Returns:
         the last carry, and what was kept, stacked `[time, ...]`.
@@ -144,5 +153,5 @@ def scan_samples(step: Callable, state: Any, visit: Callable, carry: Any, sample
         carry, kept = visit(carry, state, sample)
         return (step(state, inputs_of(sample)), carry), kept
 
-    (_, carry), kept = lax.scan(body, (state, carry), samples)
+    (_, carry), kept = scan(body, (state, carry), samples)
     return carry, kept

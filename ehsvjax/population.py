@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ehsvjax import kernels
 from ehsvjax.models.model import Equations, Model, Parameter, identity
 from ehsvjax.record import Record
 from ehsvjax.simulate import Grid, grid_of, input_array, scan_model
@@ -180,7 +181,7 @@ def population_cost(problem: Problem, individuals: Float[Array, "individual para
         total = jnp.sum(per_record(initial, problem.samples))
         return jnp.where(jnp.isnan(total), jnp.inf, total)
 
-    return jax.vmap(cost)(individuals)
+    return kernels.in_blocks(jax.vmap(cost), individuals)
 
 
 def residuals(problem: Problem, individual: Float[Array, " parameter"]) -> Float[Array, "record time signal"]:
@@ -192,15 +193,16 @@ def residuals(problem: Problem, individual: Float[Array, " parameter"]) -> Float
 
 def simulated(problem: Problem, individual: Float[Array, " parameter"]) -> Float[Array, "record time signal"]:
     """Observed outputs of one individual on every record, in their units."""
-    parameters, initial = _split(problem, individual)
 
-    def trajectory(initial, samples):
-        def keep(carry, outputs, sample):
-            return carry, jnp.stack([outputs[name] for name in problem.observed])
+    def keep(carry, outputs, sample):
+        return carry, jnp.stack([outputs[name] for name in problem.observed])
 
-        return _scan(problem, parameters, initial, samples, keep, None, None)[1]
+    def trajectories(individual):
+        parameters, initial = _split(problem, individual)
+        trajectory = functools.partial(_scan, problem, parameters, visit=keep, carry=None, rest=None)
+        return jax.vmap(lambda initial, samples: trajectory(initial, samples)[1])(initial, problem.samples)
 
-    return jax.vmap(trajectory)(initial, problem.samples)
+    return trajectories(individual)
 
 
 def _record_cost(problem: Problem, parameters, initial, samples: Samples):
@@ -241,7 +243,7 @@ def huber_weight(standardised: Float[Array, "..."], huber: float | None) -> Floa
 
 def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest):
     return scan_model(
-        problem.equations,
+        problem.equations._replace(stepper=_stored_once(problem.equations.stepper)),
         problem.grid,
         identity,
         parameters,
@@ -251,7 +253,18 @@ def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry,
         visit,
         carry,
         rest,
+        kernels.scan,
     )
+
+
+def _stored_once(stepper):
+    """Return the stepper with steps that compute no value twice."""
+
+    def tuned(parameters, step_size, signal):
+        step = stepper(parameters, step_size, signal)
+        return lambda state, inputs: kernels.stored_once(lambda state: step(state, inputs))(state)
+
+    return tuned
 
 
 def _split(problem: Problem, individual) -> tuple[Mapping[str, Any], Mapping[str, Any]]:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ehsvjax.integrators import repeated, scan_samples
@@ -126,6 +127,7 @@ def scan_model(
     visit: Callable,
     carry: Any,
     samples: Any,
+    scan: Callable = lax.scan,
 ):
     """Visit each sample of one trajectory: `visit(carry, outputs, sample) -> (carry, kept)`.
 
@@ -140,6 +142,7 @@ def scan_model(
         visit: sees the outputs by name, at the sample itself, before the inputs act.
         carry: what `visit` accumulates.
         samples: pytree of arrays `[time, ...]`, of which `visit` sees a slice.
+        scan: `lax.scan`, or what does the same.
 
     Returns:
         the last carry, and what was kept, stacked `[time, ...]`.
@@ -165,7 +168,7 @@ def scan_model(
     # A state may start from Python numbers or from a float32 constant; the loop needs one type throughout.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, inputs.dtype), state)
     step = repeated(step, grid.substeps)
-    return scan_samples(step, state, visit_state, carry, (inputs, following, samples), inputs_of)
+    return scan_samples(step, state, visit_state, carry, (inputs, following, samples), inputs_of, scan)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

@@ -1,0 +1,157 @@
+"""What makes loops fast must change nothing: against the same functions without it, and against NumPy."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax import lax
+
+from ehsvjax import kernels
+
+
+def _pendulum(state, push=0.3):
+    angle, rate = state
+    torque = push - jnp.sin(angle) - 0.1 * rate * jnp.abs(rate)
+    return angle + 0.01 * rate, rate + 0.01 * torque
+
+
+def _shared(x, y):
+    common = jnp.sin(x) * y + jnp.sqrt(jnp.abs(x)) - x / (1.0 + y * y)
+    return {"a": common + x, "b": common * y, "c": (common, common - 1.0)}
+
+
+def _branches(x, y):
+    size = jnp.where(x > y, jax.nn.relu(x), jnp.clip(y, -0.5, 0.5))
+    chosen = lax.cond(jnp.sum(x) > 0.0, jnp.cos, lambda v: v * v, size)
+    counted = lax.fori_loop(0, 3, lambda i, v: v * 0.5 + i, chosen)
+    return x, counted, counted + size, jnp.float32(2.0), x
+
+
+def _tables(x, y):
+    grid = jnp.linspace(-1.0, 1.0, 9)
+    looked_up = jnp.interp(x, grid, grid**3)
+    pair = jnp.stack([looked_up, y])
+    return jnp.array([[0.5, 0.1], [-0.2, 0.4]]) @ pair, looked_up
+
+
+def _solved(x, y):
+    matrix = jnp.array([[2.0, 0.3], [0.3, 1.0]]) + x * jnp.eye(2)
+    return jnp.linalg.solve(matrix, jnp.stack([x, y])), jnp.sort(jnp.stack([y, x]))
+
+
+EVERY_FUNCTION = pytest.mark.parametrize("function", [_shared, _branches, _tables, _solved])
+WRAPPERS = {"one kernel": kernels.one_kernel, "stored once": kernels.stored_once,
+            "both": lambda f: kernels.one_kernel(kernels.stored_once(f))}  # fmt: skip
+
+
+def _assert_close(actual, expected):
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-6, atol=1e-6), actual, expected)
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS.values(), ids=WRAPPERS)
+@EVERY_FUNCTION
+def test_values_and_derivatives_are_those_of_the_function_itself(function, wrapper):
+    x, y = jnp.linspace(-0.9, 0.8, 5), jnp.linspace(0.3, -0.7, 5)
+    wrapped = wrapper(function)
+    for transform in (
+        lambda f: jax.jit(f)(x[0], y[0]),
+        lambda f: jax.jit(jax.vmap(f))(x, y),
+        lambda f: jax.jit(jax.vmap(jax.vmap(f, (None, 0)), (0, None)))(x, y),
+        lambda f: jax.jit(functools.partial(jax.jvp, f))((x[1], y[1]), (jnp.float32(1.0), jnp.float32(-2.0))),
+        lambda f: jax.jit(jax.jacrev(lambda v: f(v, y[2])))(x[2]),
+    ):
+        _assert_close(transform(wrapped), transform(function))
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**31), st.integers(2, 30))
+def test_any_expression_graph_keeps_its_values(seed, operations):
+    rng = np.random.default_rng(seed)
+    choices = [(int(rng.integers(4)), *map(int, rng.integers(0, 3 + i, 2))) for i in range(operations)]
+    outputs = rng.integers(0, 3 + operations, 4)
+
+    def function(x, y, z):
+        values = [x, y, z]
+        for kind, i, j in choices:
+            a, b = values[i], values[j]
+            values.append([a + b, jnp.sin(a) * b, a - 0.5 * b, a / (2.0 + b * b)][kind])
+        return [values[i] for i in outputs]
+
+    arguments = [jnp.float32(v) for v in rng.uniform(-1, 1, 3)]
+    _assert_close(jax.jit(kernels.stored_once(function))(*arguments), function(*arguments))
+
+
+def test_what_several_results_need_is_computed_once():
+    def function(x):
+        root = jnp.sqrt(1.0 + x * x)
+        return [root + i for i in range(5)]
+
+    traced = jax.make_jaxpr(kernels.stored_once(function))(jnp.float32(0.5))
+    calls = [str(equation) for equation in traced.eqns if equation.primitive.name == "jit"]
+    assert len(calls) == 6  # the root, and each result
+    assert sum("sqrt" in call for call in calls) == 1
+
+
+def test_what_is_cheap_is_not_stored():
+    traced = jax.make_jaxpr(kernels.stored_once(lambda x: (x + 1.0, (x + 1.0) * 2.0)))(jnp.float32(0.5))
+    assert sum(equation.primitive.name == "jit" for equation in traced.eqns) == 2
+
+
+def test_loop_is_one_native_function():
+    def simulate(angle):
+        return lax.fori_loop(0, 1000, lambda _, state: _pendulum(state), (angle, 0.0 * angle))[0]
+
+    angles = jnp.linspace(-1.0, 1.0, 64)
+    compiled = jax.jit(lambda a: 1.0 + kernels.one_kernel(jax.vmap(simulate))(a)).lower(angles).compile()
+    entry = compiled.as_text().split("ENTRY")[1]
+    assert 'xla_cpu_small_call="true"' in entry
+    assert " while(" not in entry
+    np.testing.assert_allclose(compiled(angles), 1.0 + jax.vmap(simulate)(angles), rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 31, 32, 33, 64, 97, 200])
+@pytest.mark.parametrize("keeps", [True, False])
+def test_scan_is_that_of_jax(count, keeps):
+    def body(state, push):
+        state = _pendulum(state, push)
+        return state, {"angle": state[0], "both": jnp.stack(state)} if keeps else None
+
+    pushes = jnp.sin(jnp.arange(count) * 0.1)
+    start = (jnp.float32(0.2), jnp.float32(0.0))
+    _assert_close(jax.jit(functools.partial(kernels.scan, body))(start, pushes), lax.scan(body, start, pushes))
+
+
+@pytest.mark.parametrize("count", [1, 3, 15, 16, 17, 100, 255, 256, 257, 600])
+def test_blocks_do_not_show(count):
+    rows = jnp.asarray(np.random.default_rng(count).uniform(-1, 1, (count, 3)), jnp.float32)
+
+    def cost(row):
+        return lax.fori_loop(0, 20, lambda _, s: _pendulum(s, row[2]), (row[0], row[1]))[0]
+
+    blocked = jax.jit(functools.partial(kernels.in_blocks, jax.vmap(cost)))(rows)
+    assert blocked.shape == (count,)
+    np.testing.assert_allclose(blocked, jax.vmap(cost)(rows), rtol=1e-5, atol=1e-6)
+    # An individual costs the same to the last bit wherever it stands, so that the order does not matter.
+    if count > 16:
+        np.testing.assert_array_equal(
+            jax.jit(functools.partial(kernels.in_blocks, jax.vmap(cost)))(rows[::-1]), blocked[::-1]
+        )
+
+
+def test_elsewhere_than_on_the_cpu_everything_is_the_function_itself(monkeypatch):
+    monkeypatch.setattr(kernels, "_on_cpu", lambda: False)
+    x, y = jnp.float32(0.3), jnp.float32(-0.4)
+    for wrapper in WRAPPERS.values():
+        assert "xla_metadata" not in str(jax.make_jaxpr(wrapper(_shared))(x, y))
+    rows = jnp.ones((40, 2))
+    assert "xla_metadata" not in str(jax.make_jaxpr(functools.partial(kernels.in_blocks, lambda r: r[:, 0]))(rows))
+
+
+def test_device_that_the_user_chose_is_heeded():
+    assert kernels._on_cpu()
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert kernels._on_cpu()
