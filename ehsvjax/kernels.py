@@ -61,7 +61,6 @@ def one_kernel(function: Callable) -> Callable:
 
     The function takes and returns arrays; Python values belong into a closure.
     """
-
     compiled = jax.jit(function)
 
     def called(*args):
