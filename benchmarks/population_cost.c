@@ -72,7 +72,8 @@ void servovalve(int count, int samples, int substeps, float period, float scale,
   const float area = constants[0], supply = constants[1], mass = constants[2], stiffness = constants[3];
   const float h = period / substeps, hs = stage * h, inertia = mass + hs * hs * stiffness;
   const float storage = constants[4] / hs, leakage = constants[5];
-  const float by_pressure = hs * area * area / inertia + leakage + storage;
+  const float by_momentum = area / inertia, per_area = 1.0f / area, per_stage = 1.0f / hs;
+  const float by_flow = 1.0f / (hs * area * by_momentum + leakage + storage);
 #pragma omp parallel for schedule(static)
   for (int block = 0; block < count; block += LANES) {
     float dead[LANES], limit[LANES], gain[LANES], feedback[LANES], lag[LANES], sum[LANES];
@@ -103,20 +104,20 @@ void servovalve(int count, int samples, int substeps, float period, float scale,
 #pragma omp simd
         for (int i = 0; i < LANES; i++) {
           const float e = u - feedback[i] * x[i];
-          float slope = (u - feedback[i] * (x[i] + hs * v[i]) - e) / hs;
+          float slope = (u - feedback[i] * (x[i] + hs * v[i]) - e) * per_stage;
           float deviation = p[i] - e + lag[i] * slope, rate_deviation = r[i] - slope;
           float spool = p[i] + slope * hs + yy1[i] * deviation + yr1[i] * rate_deviation;
 
           float opening = clip(spool - clip(spool, dead[i]), limit[i]);
-          float at_rest = area * (mass * v[i] - hs * stiffness * x[i]) / inertia - storage * pressure[i];
-          float half_slope = 0.5f * gain[i] * fabsf(opening) / by_pressure;
-          float drop = supply + (opening < 0.0f ? -1.0f : 1.0f) * at_rest / by_pressure;
+          float at_rest = by_momentum * (mass * v[i] - hs * stiffness * x[i]) - storage * pressure[i];
+          float half_slope = 0.5f * gain[i] * by_flow * fabsf(opening);
+          float drop = supply + (opening < 0.0f ? -1.0f : 1.0f) * at_rest * by_flow;
           float flow = gain[i] * opening * drop / (half_slope + sqrtf(half_slope * half_slope + fabsf(drop)));
-          const float pressure1 = (flow - at_rest) / by_pressure;
-          const float v1 = (flow - leakage * pressure1 - storage * (pressure1 - pressure[i])) / area;
+          const float pressure1 = (flow - at_rest) * by_flow;
+          const float v1 = (flow - leakage * pressure1 - storage * (pressure1 - pressure[i])) * per_area;
           const float x1 = x[i] + hs * v1;
 
-          slope = (u - feedback[i] * x1 - e) / hs;
+          slope = (u - feedback[i] * x1 - e) * per_stage;
           deviation = p[i] - e + lag[i] * slope, rate_deviation = r[i] - slope;
           spool = p[i] + slope * h + yy[i] * deviation + yr[i] * rate_deviation;
           r[i] += ry[i] * deviation + rr[i] * rate_deviation;
@@ -125,12 +126,12 @@ void servovalve(int count, int samples, int substeps, float period, float scale,
           const float xs = x[i] + carried * (x1 - x[i]), vs = v[i] + carried * (v1 - v[i]);
           const float ps = pressure[i] + carried * (pressure1 - pressure[i]);
           opening = clip(spool - clip(spool, dead[i]), limit[i]);
-          at_rest = area * (mass * vs - hs * stiffness * xs) / inertia - storage * ps;
-          half_slope = 0.5f * gain[i] * fabsf(opening) / by_pressure;
-          drop = supply + (opening < 0.0f ? -1.0f : 1.0f) * at_rest / by_pressure;
+          at_rest = by_momentum * (mass * vs - hs * stiffness * xs) - storage * ps;
+          half_slope = 0.5f * gain[i] * by_flow * fabsf(opening);
+          drop = supply + (opening < 0.0f ? -1.0f : 1.0f) * at_rest * by_flow;
           flow = gain[i] * opening * drop / (half_slope + sqrtf(half_slope * half_slope + fabsf(drop)));
-          pressure[i] = (flow - at_rest) / by_pressure;
-          v[i] = (flow - leakage * pressure[i] - storage * (pressure[i] - ps)) / area;
+          pressure[i] = (flow - at_rest) * by_flow;
+          v[i] = (flow - leakage * pressure[i] - storage * (pressure[i] - ps)) * per_area;
           x[i] = xs + hs * v[i];
         }
       }

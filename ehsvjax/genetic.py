@@ -188,7 +188,7 @@ def run(
             best_cost=history.best_cost.at[k].set(state.elite_cost[0]),
             median_cost=history.median_cost.at[k].set(jnp.median(state.cost)),
             failed=history.failed.at[k].set(jnp.mean(jnp.isinf(state.cost), dtype=state.cost.dtype)),
-            spread=history.spread.at[k].set(_spread(state.population, state.cost)),
+            spread=history.spread.at[k].set(spread(state.population, state.cost)),
             best=history.best.at[k].set(state.elites[0]),
         )
 
@@ -213,8 +213,8 @@ def best_distinct(
     return (apart + [i for i in order if i not in apart])[:count]
 
 
-def _spread(population, cost):
-    """Largest standard deviation over the unknowns of the better half; one individual alone has none to judge."""
+def spread(population: Float[Array, "individual parameter"], cost: Float[Array, " individual"]) -> Float[Array, ""]:
+    """Return the largest standard deviation over the unknowns of the better half; +inf for one individual alone."""
     half = len(cost) // 2
     if half < 2:
         return jnp.asarray(jnp.inf, cost.dtype)

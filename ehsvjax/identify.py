@@ -14,7 +14,7 @@ from ehsvjax import genetic
 from ehsvjax.fit import Effort, Fit, History
 from ehsvjax.genetic import Operators
 from ehsvjax.models.model import Model
-from ehsvjax.population import Problem, cast, population_cost, residuals, to_unit, to_values
+from ehsvjax.population import Problem, cast, population_cost, residuals, shared_cost, to_unit, to_values
 from ehsvjax.record import Record
 from ehsvjax.refine import Refined
 from ehsvjax.refine import refine as refine_starts
@@ -40,6 +40,8 @@ def identify(
     operators: Operators = DEFAULT_OPERATORS,
     tolerance: float = 0.01,
     starts: int = 4,
+    islands: int = 1,
+    devices: Sequence[jax.Device] | None = None,
     progress: bool = False,
     checkpoint: str | os.PathLike | None = None,
 ) -> Fit:
@@ -67,6 +69,9 @@ def identify(
         tolerance: the search stops before the last generation once a quarter of the population lies within this many
             noise variances of the best; 0 never stops.
         starts: how many of the best individuals that lie apart are refined.
+        islands: populations that evolve apart and now and then exchange their best, each of `population` individuals.
+        devices: those that share the simulations of a population, or the islands, `jax.devices()` for all, those of
+            other processes under `jax.distributed` included; by default one. They change no result.
         progress: show a bar over generations.
         checkpoint: file written after every generation, from which a killed run goes on to the same result.
 
@@ -79,17 +84,21 @@ def identify(
     """
     records = (records,) if isinstance(records, Record) else tuple(records)
     _check_call(records, key, starts, tolerance)
+    devices = None if devices is None else _checked_devices(devices)
+    cost = population_cost if devices is None or islands > 1 else shared_cost(devices)
     model = model.with_bounds(bounds, fixed)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
 
     found, history = search(
-        Partial(population_cost, cast(problem, jnp.float32)),
+        Partial(cost, cast(problem, jnp.float32)),
         key,
         unknowns=problem.unknowns,
         population=population,
         generations=generations,
         operators=operators,
         tolerance=tolerance,
+        islands=islands,
+        devices=devices,
         progress=progress,
         checkpoint=checkpoint,
     )
@@ -150,6 +159,13 @@ def _check_call(records, key, starts, tolerance):
         raise ValueError(f"expected starts to be a whole number of at least 1, got {starts!r}")
     if not tolerance >= 0:
         raise ValueError(f"expected tolerance to be zero or more noise variances, got {tolerance!r}")
+
+
+def _checked_devices(devices) -> tuple[jax.Device, ...]:
+    devices = tuple(devices)
+    if not devices or not all(isinstance(device, jax.Device) for device in devices):
+        raise ValueError(f"expected devices such as jax.devices(), got {devices}")
+    return devices
 
 
 def _search_effort(found: genetic.State, generations: int) -> Effort:

@@ -8,13 +8,15 @@ initial conditions of each record in turn.
 """
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from ehsvjax import kernels
@@ -182,6 +184,24 @@ def population_cost(problem: Problem, individuals: Float[Array, "individual para
         return jnp.where(jnp.isnan(total), jnp.inf, total)
 
     return kernels.in_blocks(jax.vmap(cost), individuals)
+
+
+@functools.cache
+def shared_cost(devices: tuple[jax.Device, ...]) -> Callable:
+    """Return `population_cost` with the individuals shared out to devices; the same function for the same devices."""
+    mesh = Mesh(np.array(devices), ("individual",))
+    rows, alike = PartitionSpec("individual"), PartitionSpec()
+    # Only the cost is shared out: what is bred from it is the same work on every device, and cheaper than a message.
+    everywhere = functools.partial(lax.with_sharding_constraint, shardings=NamedSharding(mesh, alike))
+
+    def cost(problem: Problem, individuals):
+        count = len(individuals)
+        filling = jnp.broadcast_to(individuals[-1:], (-count % len(devices), individuals.shape[1]))
+        filled = everywhere(jnp.concatenate([individuals, filling]))
+        here = jax.shard_map(population_cost, mesh=mesh, in_specs=(alike, rows), out_specs=rows, check_vma=False)
+        return everywhere(here(problem, filled))[:count]
+
+    return cost
 
 
 def residuals(problem: Problem, individual: Float[Array, " parameter"]) -> Float[Array, "record time signal"]:

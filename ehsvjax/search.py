@@ -1,19 +1,22 @@
 """The genetic search as a person runs it: one compiled call, or generation by generation with a bar or a checkpoint."""
 
+import functools
 import hashlib
 import os
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.multihost_utils import process_allgather
 from jaxtyping import Array, Key
 
 from ehsvjax import genetic
+from ehsvjax import islands as archipelago
 from ehsvjax.genetic import History, Operators, State
 
 
@@ -26,6 +29,8 @@ def search(
     generations: int,
     operators: Operators,
     tolerance: float,
+    islands: int = 1,
+    devices: Sequence[jax.Device] | None = None,
     progress: bool = False,
     checkpoint: str | os.PathLike | None = None,
 ) -> tuple[State, History]:
@@ -39,6 +44,8 @@ def search(
         generations: at most this many.
         operators: the operators.
         tolerance: of the stop test; 0 runs all generations.
+        islands: populations that evolve apart and exchange their best, each of `population` individuals.
+        devices: those that share several islands; by default the first alone.
         progress: show a bar.
         checkpoint: file to write after every generation, and to go on from if it exists.
 
@@ -46,28 +53,69 @@ def search(
         ValueError: for sizes that cannot be, or a checkpoint of another search.
 
     """
-    _check_sizes(population, generations, operators)
+    _check_sizes(population, generations, operators, islands)
     key = jax.random.wrap_key_data(key) if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else key
-    state, history = genetic.init(key, population, unknowns, generations, operators.elites)
+    if islands == 1:
+        state, history = genetic.init(key, population, unknowns, generations, operators.elites)
+        return _run(genetic.run, cost, operators, state, history, tolerance, progress, checkpoint)
+    state, history = archipelago.init(key, islands, population, unknowns, generations, operators.elites)
+    run = functools.partial(archipelago.run, devices=tuple(devices or jax.devices()[:1]))
+    state, history = _run(run, cost, operators, state, history, tolerance, progress, checkpoint)
+    return archipelago.merged(state, operators.elites), history
+
+
+def _run(
+    run: Callable,
+    cost: Callable,
+    operators: Operators,
+    state: State,
+    history: History,
+    tolerance: float,
+    progress: bool,
+    checkpoint: str | os.PathLike | None,
+) -> tuple[State, History]:
+    """Run to the end in one call, or generation by generation."""
+    generations = len(history.best_cost)
     if checkpoint is None and not progress:
-        return genetic.run(cost, operators, state, history, generations, tolerance)
+        return _at_home(run(cost, operators, state, history, generations, tolerance))
 
     mark = ""
     if checkpoint is not None:
         mark = _fingerprint(cost, operators, state, generations, tolerance)
         state, history = _restore(Path(checkpoint), mark, (state, history))
-    with _bar(progress, generations, int(state.generation)) as bar:
-        while int(state.generation) < generations and not bool(state.converged):
-            state, history = genetic.run(cost, operators, state, history, state.generation + 1, tolerance)
+    # Every island has come to the same generation, and they stop together.
+    done = int(np.ravel(state.generation)[0])
+    with _bar(progress, generations, done) as bar:
+        while done < generations and not np.ravel(state.converged)[0]:
+            done += 1
+            state, history = _at_home(run(cost, operators, state, history, done, tolerance))
             if checkpoint is not None:
                 _store(Path(checkpoint), mark, (state, history))
-            bar.set_postfix(cost=f"{float(state.elite_cost[0]):.6g}", refresh=False)
+            bar.set_postfix(cost=f"{float(history.best_cost[done - 1]):.6g}", refresh=False)
             bar.update()
     return state, history
 
 
-def _check_sizes(population: int, generations: int, operators: Operators) -> None:
-    for name, value, least in (("population", population, 4), ("generations", generations, 1)):
+def _at_home(both: tuple[State, History]) -> tuple[State, History]:
+    """Return arrays that are alike on every device, those of other processes included, on the usual one."""
+    if all(leaf.sharding.is_fully_addressable and len(leaf.devices()) == 1 for leaf in jax.tree.leaves(both)):
+        return both
+
+    def local(leaf):
+        return jnp.asarray(np.asarray(leaf if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)))
+
+    return _with_key(jax.tree.map(local, _raw(both)), both[0].key)
+
+
+def _with_key(raw: tuple[State, History], like: Key[Array, "*island"]) -> tuple[State, History]:
+    """Return a state whose random key is plain numbers with the key made again."""
+    state, history = raw
+    return state._replace(key=jax.random.wrap_key_data(state.key, impl=jax.random.key_impl(like))), history
+
+
+def _check_sizes(population: int, generations: int, operators: Operators, islands: int) -> None:
+    sizes = (("population", population, 4), ("generations", generations, 1), ("islands", islands, 1))
+    for name, value, least in sizes:
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
             raise ValueError(f"expected {name} to be a whole number of at least {least}, got {value!r}")
     if not 1 <= operators.elites < population:
@@ -143,6 +191,4 @@ def _restore(path: Path, mark: str, fresh: tuple[State, History]) -> tuple[State
             f"expected {path} to be the checkpoint of this search, got one of another (other data, model, key, "
             "sizes or operators): remove it or name a new one"
         )
-    raw = jax.tree.unflatten(jax.tree.structure(_raw(fresh)), leaves)
-    state, history = raw
-    return state._replace(key=jax.random.wrap_key_data(state.key, impl=jax.random.key_impl(fresh[0].key))), history
+    return _with_key(jax.tree.unflatten(jax.tree.structure(_raw(fresh)), leaves), fresh[0].key)

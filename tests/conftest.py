@@ -5,6 +5,8 @@ from beartype import BeartypeConf
 from jaxtyping import install_import_hook
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+# Two devices, so that sharing work between them is tested on any machine.
+jax.config.update("jax_num_cpu_devices", 2)
 
 # PEP 484's numeric tower: an int may stand where a float is asked for.
 _typechecker = "tests.conftest.checked"

@@ -183,11 +183,12 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
         filtered = initial["initial_filtered"]
         command = inputs["command"]
         opening = opening_of(parameters, spool_of(command, filtered, identity), identity)
-        load_pressure = parameters["stiffness"] * position / parameters["piston_area"]
+        per_area = 1.0 / parameters["piston_area"]
+        load_pressure = parameters["stiffness"] * per_area * position
         flow = hydraulics.load_flow(parameters["flow_gain"], opening, parameters["supply_pressure"], load_pressure)
         return ServovalveState(
             position=position,
-            velocity=flow / parameters["piston_area"],
+            velocity=flow * per_area,
             filtered=filtered,
             filtered_rate=initial["initial_filtered_rate"],
             load_pressure=load_pressure,
@@ -196,6 +197,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
     def stepper(parameters, step_size, signal):
         """Return one step: the transfer function exactly, for an input drawn as a straight line; the load by SDIRK."""
         stage_size = SDIRK_GAMMA * step_size
+        per_stage_size = 1.0 / stage_size
         to_stage, to_end = (
             second_order_filter(parameters["damping_ratio"], parameters["natural_frequency"], duration)
             for duration in (stage_size, step_size)
@@ -219,7 +221,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
             # First stage. The drive's slope is predicted from the velocity: an error of third order in the spool.
             predicted = state.position + stage_size * state.velocity
             e_predicted = spool_drive(command_stage, predicted, (opening, supply, state.load_pressure))
-            filtered, _ = to_stage(state.filtered, state.filtered_rate, e, (e_predicted - e) / stage_size)
+            filtered, _ = to_stage(state.filtered, state.filtered_rate, e, (e_predicted - e) * per_stage_size)
             opening = opening_of(parameters, spool_of(command_stage, filtered, signal), signal)
             position, velocity, pressure = load_stage(
                 state.position, state.velocity, state.load_pressure, opening, supply, force
@@ -227,7 +229,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
 
             # Second stage, from the state that the first stage's rates lead to.
             e_stage = spool_drive(command_stage, position, (opening, supply, pressure))
-            filtered, filtered_rate = to_end(state.filtered, state.filtered_rate, e, (e_stage - e) / stage_size)
+            filtered, filtered_rate = to_end(state.filtered, state.filtered_rate, e, (e_stage - e) * per_stage_size)
             carried = (1.0 - SDIRK_GAMMA) / SDIRK_GAMMA
             opening = opening_of(parameters, spool_of(command_end, filtered, signal), signal)
             position, velocity, pressure = load_stage(
@@ -267,21 +269,25 @@ def _load_stage(parameters, h):
     area, mass, stiffness = parameters["piston_area"], parameters["mass"], parameters["stiffness"]
     storage = parameters["hydraulic_capacitance"] / h
     leakage = parameters["leakage_coefficient"]
-    inertia = mass + h * h * stiffness
-    flow_by_pressure = h * area * area / inertia + leakage + storage
+    # What does not change is divided by once, here: a reciprocal serves every step.
+    flow_by_momentum = area / (mass + h * h * stiffness)
+    pressure_by_flow = 1.0 / (h * area * flow_by_momentum + leakage + storage)
+    half_slope_by_opening = 0.5 * parameters["flow_gain"] * pressure_by_flow
+    per_area = 1.0 / area
 
     def stage(position, velocity, pressure, opening, supply, force):
-        flow_at_rest = area * (mass * velocity - h * (stiffness * position + force)) / inertia - storage * pressure
+        momentum = mass * velocity - h * (stiffness * position + force)
+        flow_at_rest = flow_by_momentum * momentum - storage * pressure
         direction = jnp.where(opening < 0.0, -1.0, 1.0)
-        half_slope = 0.5 * parameters["flow_gain"] * jnp.abs(opening) / flow_by_pressure
-        drop = supply + direction * flow_at_rest / flow_by_pressure
+        half_slope = half_slope_by_opening * jnp.abs(opening)
+        drop = supply + direction * flow_at_rest * pressure_by_flow
         square = half_slope * half_slope + jnp.abs(drop)
         # Closed, and just balanced by the load: no flow, and no derivative of a root of zero.
         flowing = square > 0.0
         root = jnp.where(flowing, drop / (half_slope + jnp.sqrt(jnp.where(flowing, square, 1.0))), 0.0)
         flow = parameters["flow_gain"] * opening * root
-        pressure_end = (flow - flow_at_rest) / flow_by_pressure
-        velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) / area
+        pressure_end = (flow - flow_at_rest) * pressure_by_flow
+        velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) * per_area
         return position + h * velocity_end, velocity_end, pressure_end
 
     return stage
