@@ -1,6 +1,7 @@
 """From a record made by an independent plant to a fit, in all the ways that `identify` offers."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import ehsvjax
-from ehsvjax import excitation
+from ehsvjax import excitation, search
 from tests import plants
 
 ROOT = Path(__file__).parents[1]
@@ -278,6 +279,25 @@ def test_killed_run_goes_on_to_the_same_result(record, tmp_path, killed_after):
     )
     assert "result" in whole
     assert resumed == whole
+
+
+def test_a_run_goes_on_from_every_generation_to_the_same_result(record, tmp_path, monkeypatch):
+    kept, store = [], search._store
+
+    def store_and_keep(path, *rest):
+        store(path, *rest)
+        kept.append(shutil.copy(path, tmp_path / f"generation_{len(kept)}"))
+
+    options = {"population": 20, "generations": 12, "tolerance": 0.0}
+    whole = _identified(record, **options)
+    with monkeypatch.context() as patched:
+        patched.setattr(search, "_store", store_and_keep)
+        _identified(record, **options, checkpoint=tmp_path / "run")
+    assert len(kept) == 12
+    for path in kept:
+        resumed = _identified(record, **options, checkpoint=path)
+        assert resumed.parameters == whole.parameters
+        np.testing.assert_array_equal(resumed.history.best_cost, whole.history.best_cost)
 
 
 def test_progress_bar_and_checkpoint_change_nothing(record, fit, tmp_path, capfd):

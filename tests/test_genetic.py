@@ -100,7 +100,10 @@ def test_stop_test_ends_the_run():
     ids=["rank", "roulette", "blend", "line", "binary", "polynomial"],
 )
 def test_every_operator_beats_random_search(chosen):
-    _, history = _run(chosen=chosen)
+    state, history = _run(chosen=chosen)
+    assert np.all((state.candidates >= 0) & (state.candidates <= 1))
+    assert np.all(np.diff(history.best_cost) <= 0)
+    assert np.min(state.cost) == state.elite_cost[0]
     random = np.random.default_rng(0).random((POPULATION * GENERATIONS, UNKNOWNS))
     assert history.best_cost[-1] < np.min(_sphere(CENTRE, random))
 

@@ -1,0 +1,127 @@
+"""The public face: every name says what it is, importing is cheap and changes nothing, and imports point one way."""
+
+import ast
+import importlib
+import inspect
+import json
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import ehsvjax
+
+PACKAGE = Path(ehsvjax.__file__).parent
+MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "ehsvjax.") if m.name != "ehsvjax.__main__")
+
+
+def _public(module):
+    return [
+        (name, value)
+        for name, value in vars(module).items()
+        if not name.startswith("_") and getattr(value, "__module__", None) == module.__name__ and callable(value)
+    ]
+
+
+def test_all_is_sorted_and_there():
+    assert ehsvjax.__all__ == sorted(ehsvjax.__all__)
+    for name in ehsvjax.__all__:
+        assert getattr(ehsvjax, name).__doc__, name
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_every_public_name_is_documented(name):
+    module = importlib.import_module(name)
+    assert module.__doc__, name
+    for label, value in _public(module):
+        assert inspect.getdoc(value), f"{name}.{label}"
+        if inspect.isclass(value):
+            for method, function in vars(value).items():
+                if not method.startswith("_") and (inspect.isfunction(function) or isinstance(function, property)):
+                    assert inspect.getdoc(function), f"{name}.{label}.{method}"
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_refusals_are_documented(name):
+    """A public function that raises says so."""
+    tree = ast.parse(Path(importlib.import_module(name).__file__).read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            raises = [n for n in ast.walk(node) if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)]
+            if raises:
+                assert "Error" in (ast.get_docstring(node) or ""), f"{name}.{node.name}"
+
+
+@pytest.mark.parametrize("room", ["genetic", "islands", "operators", "population", "precision", "refine"])
+def test_arrays_of_public_functions_have_their_axes_named(room):
+    name = f"ehsvjax.{room}"
+    for label, value in _public(importlib.import_module(name)):
+        if inspect.isfunction(value):
+            for annotation in inspect.get_annotations(inspect.unwrap(value)).values():
+                assert str(annotation) not in ("<class 'jax.Array'>", "<class 'numpy.ndarray'>"), f"{name}.{label}"
+
+
+CHEAP = """
+import json, sys
+import jax
+before = dict(jax.config.values)
+import ehsvjax
+heavy = [m for m in ("pandas", "matplotlib.pyplot", "scipy.io", "jinja2", "tqdm", "IPython") if m in sys.modules]
+from jax._src import xla_bridge
+print(json.dumps({"heavy": heavy, "changed": [k for k, v in jax.config.values.items() if before[k] != v],
+                  "backends": bool(xla_bridge._backends)}))
+"""
+
+
+def test_importing_is_cheap_and_changes_nothing():
+    out = subprocess.run([sys.executable, "-c", CHEAP], capture_output=True, text=True, check=True).stdout
+    assert json.loads(out) == {"heavy": [], "changed": [], "backends": False}
+
+
+# What each room must not import at its top level, directly or through others: imports point down only.
+NEVER = {
+    "record": ("models", "population", "genetic", "identify", "fit"),
+    "excitation": ("models", "record", "population", "genetic"),
+    "hydraulics": ("models", "record", "population", "genetic"),
+    "models.model": ("population", "genetic", "operators", "identify", "simulate", "record"),
+    "models.servovalve": ("population", "genetic", "operators", "identify", "record"),
+    "models.van_der_pol": ("population", "genetic", "operators", "identify", "record"),
+    "integrators": ("models", "population", "genetic", "record", "kernels"),
+    "kernels": ("models", "population", "genetic", "record", "simulate"),
+    "simulate": ("population", "genetic", "operators", "identify"),
+    "population": ("genetic", "operators", "search", "identify", "fit"),
+    "operators": ("population", "models", "record", "genetic", "simulate"),
+    "genetic": ("population", "models", "record", "simulate", "hydraulics"),
+    "islands": ("population", "models", "record", "simulate", "hydraulics"),
+    "search": ("population", "models", "record", "simulate"),
+    "refine": ("genetic", "operators", "search", "identify"),
+    "precision": ("genetic", "operators", "search", "refine", "identify"),
+    "identify": ("plots", "report", "paper", "models.servovalve", "models.van_der_pol"),
+    "fit": ("plots", "report", "paper", "population", "genetic"),
+}
+
+
+def _imported(name: str) -> set[str]:
+    """Modules of the package that a module imports at its top level, and those that they import."""
+    found: set[str] = set()
+    waiting = [name]
+    while waiting:
+        tree = ast.parse(Path(importlib.import_module(waiting.pop()).__file__).read_text())
+        for node in tree.body:
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("ehsvjax"):
+                for alias in node.names:
+                    candidate = f"{node.module}.{alias.name}"
+                    target = candidate if candidate in MODULES else node.module
+                    if target != "ehsvjax" and target not in found:
+                        found.add(target)
+                        waiting.append(target)
+    return found
+
+
+@pytest.mark.parametrize(("room", "never"), NEVER.items(), ids=list(NEVER))
+def test_imports_point_down_only(room, never):
+    assert {f"ehsvjax.{name}" for name in never} & _imported(f"ehsvjax.{room}") == set()
+    for top in ("report", "plots", "__main__"):
+        assert f"ehsvjax.{top}" not in _imported(f"ehsvjax.{room}")
