@@ -21,9 +21,14 @@ types: $(VENV)/installed-develop
 notebooks: $(VENV)/installed-develop
 	$(BIN)/python notebooks/run_all.py
 
-benchmarks: $(VENV)/installed-test
+# What the fits are worth, then how fast they are. Speed wants a quiet machine.
+benchmarks: $(VENV)/installed-benchmark
 	$(BIN)/python benchmarks/monte_carlo.py
 	$(BIN)/python benchmarks/wide_bounds.py
+	$(BIN)/python benchmarks/generations_per_second.py
+	$(BIN)/python benchmarks/against_c.py
+	$(BIN)/python benchmarks/scaling.py
+	$(BIN)/python benchmarks/cold_start.py
 
 $(VENV)/bin/python:
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'ehsvjax needs Python 3.11 or newer')"
@@ -39,6 +44,10 @@ $(VENV)/installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/installed-develop: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[develop]"
+	touch $@
+
+$(VENV)/installed-benchmark: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[benchmark]"
 	touch $@
 
 clean:

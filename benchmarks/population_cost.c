@@ -7,6 +7,31 @@
 #define LANES 32
 #endif
 
+#ifdef __AVX512F__
+#define VECTOR 16
+#else
+#define VECTOR 8
+#endif
+typedef float vector __attribute__((vector_size(4 * VECTOR)));
+
+/* What the cores can do at best: twelve independent chains of multiply-adds in registers. Returns the number of
+   floating-point operations. */
+double multiply_adds(long rounds, float *sink) {
+  double operations = 0;
+#pragma omp parallel reduction(+ : operations)
+  {
+    vector chain[12], factor, term;
+    for (int j = 0; j < VECTOR; j++) factor[j] = 0.999f, term[j] = 1e-3f;
+    for (int k = 0; k < 12; k++) chain[k] = term * (float)k;
+    for (long i = 0; i < rounds; i++)
+      for (int k = 0; k < 12; k++) chain[k] = chain[k] * factor + term;
+    for (int k = 1; k < 12; k++) chain[0] += chain[k];
+    sink[0] = chain[0][0];
+    operations += 2.0 * 12 * VECTOR * rounds;
+  }
+  return operations;
+}
+
 /* Van der Pol oscillator, Runge-Kutta 4. parameters: [4][count] alpha, gamma, x1(0), x2(0). */
 void van_der_pol(int count, int samples, int substeps, float period, float scale, const float *restrict parameters,
                  const float *restrict command, const float *restrict measured, float *restrict cost) {

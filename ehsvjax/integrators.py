@@ -111,16 +111,22 @@ def _even_series(d):
 def repeated(step: Callable, count: int) -> Callable:
     """Return the step applied `count` times, over `count` equal parts of the time in which the inputs run from 0 to 1.
 
-    A loop rather than an unrolled body: unrolling makes XLA compute shared values again and again (measured: twice the
-    time for 2 substeps, more for 4).
+    A loop of two at a time where the count is even: XLA copies the state once a turn, and a longer body takes longer to
+    compile (measured on the CPU: two at a time save a tenth of Van der Pol's time, four at a time 3% more).
     """
-    if count == 1:
-        return step
+    together = 2 if count % 2 == 0 else 1
 
     def part(k, state, inputs):
         return step(state, lambda fraction: inputs((k + fraction) / count))
 
-    return lambda state, inputs: lax.fori_loop(0, count, lambda k, state: part(k, state, inputs), state)
+    def turn(k, state, inputs):
+        for i in range(together):
+            state = part(k * together + i, state, inputs)
+        return state
+
+    if count == together:
+        return functools.partial(turn, 0) if count > 1 else step
+    return lambda state, inputs: lax.fori_loop(0, count // together, lambda k, state: turn(k, state, inputs), state)
 
 
 def scan_samples(

@@ -33,8 +33,9 @@ _WORTH_STORING = 8
 _BLOCK = 256
 # Samples that one kernel stores.
 _STORED_TOGETHER = 32
-# Blocks are filled up to whole vector registers, of 16 single-precision numbers at most.
-_VECTOR = 16
+# Blocks are filled up to whole vector registers, of 16 single-precision numbers at most. Narrower ones are compiled
+# differently, and round differently in the last bit.
+VECTOR = 16
 
 # Primitives that XLA compiles inside one function. A sort, a scatter, or a call of a library cannot be there.
 _COMPILED_INSIDE = frozenset(
@@ -84,16 +85,21 @@ def in_blocks(function: Callable, rows: Float[Array, "individual parameter"]) ->
     The last row is repeated to fill the last block.
     """
     count = len(rows)
-    if not _on_cpu() or count < _VECTOR:
+    if not _on_cpu() or count == 1:
         return one_kernel(function)(rows)
     blocks = -(-count // _BLOCK)
-    width = -(-count // (blocks * _VECTOR)) * _VECTOR
-    filling = jnp.broadcast_to(rows[-1:], (blocks * width - count, rows.shape[1]))
-    filled = jnp.concatenate([rows, filling])
+    width = -(-count // (blocks * VECTOR)) * VECTOR
+    rows = filled_up(rows, blocks * width)
     if blocks == 1:
-        return one_kernel(function)(filled)[:count]
+        return one_kernel(function)(rows)[:count]
     kernel = one_kernel(lambda blocks: lax.map(function, blocks))
-    return kernel(filled.reshape(blocks, width, -1)).reshape(-1)[:count]
+    return kernel(rows.reshape(blocks, width, -1)).reshape(-1)[:count]
+
+
+def filled_up(rows: Float[Array, "individual parameter"], multiple: int) -> Float[Array, "filled parameter"]:
+    """Return the rows with the last one repeated until their number is a multiple of this."""
+    filling = jnp.broadcast_to(rows[-1:], (-len(rows) % multiple, rows.shape[1]))
+    return jnp.concatenate([rows, filling])
 
 
 def scan(body: Callable, carry: Any, samples: Any) -> tuple[Any, Any]:

@@ -24,6 +24,9 @@ from ehsvjax.models.model import Equations, Model, Parameter, identity
 from ehsvjax.record import Record
 from ehsvjax.simulate import Grid, grid_of, input_array, scan_model
 
+# Samples whose squares are added up plainly before the sum is added to the rest.
+_SUMMED_TOGETHER = 64
+
 
 class Samples(NamedTuple):
     """Records side by side, padded at the end to the longest; `measured` is False where there is no sample."""
@@ -195,11 +198,9 @@ def shared_cost(devices: tuple[jax.Device, ...]) -> Callable:
     everywhere = functools.partial(lax.with_sharding_constraint, shardings=NamedSharding(mesh, alike))
 
     def cost(problem: Problem, individuals):
-        count = len(individuals)
-        filling = jnp.broadcast_to(individuals[-1:], (-count % len(devices), individuals.shape[1]))
-        filled = everywhere(jnp.concatenate([individuals, filling]))
+        filled = everywhere(kernels.filled_up(individuals, len(devices) * kernels.VECTOR))
         here = jax.shard_map(population_cost, mesh=mesh, in_specs=(alike, rows), out_specs=rows, check_vma=False)
-        return everywhere(here(problem, filled))[:count]
+        return everywhere(here(problem, filled))[: len(individuals)]
 
     return cost
 
@@ -228,22 +229,43 @@ def simulated(problem: Problem, individual: Float[Array, " parameter"]) -> Float
 def _record_cost(problem: Problem, parameters, initial, samples: Samples):
     scale = 1.0 / jnp.sqrt(problem.noise_variance)
 
-    def accumulate(carry, outputs, sample):
-        total, lost = carry
+    def accumulate(total, outputs, sample):
         measured_outputs, measured = sample
-        terms = [
-            jnp.where(measured[i], robust_square(scale[i] * (measured_outputs[i] - outputs[name]), problem.huber), 0.0)
-            for i, name in enumerate(problem.observed)
-        ]
-        # Compensated (Kahan) summation: in float32 a sum over a million samples would lose its last digits.
-        term = sum(terms) - lost
-        following = total + term
-        return (following, (following - total) - term), None
+        for i, name in enumerate(problem.observed):
+            square = robust_square(scale[i] * (measured_outputs[i] - outputs[name]), problem.huber)
+            total = total + jnp.where(measured[i], square, 0.0)
+        return total, None
 
     zero = jnp.zeros((), samples.outputs.dtype)
     rest = (samples.outputs, samples.measured)
-    (total, _), _ = _scan(problem, parameters, initial, samples, accumulate, (zero, zero), rest)
-    return total
+    return _scan(problem, parameters, initial, samples, accumulate, zero, rest, _scan_by_parts)[0]
+
+
+def _scan_by_parts(body: Callable, carry: Any, samples: Any):
+    """Scan with a state and a sum; the sum starts anew for every few samples, and the sums are added with compensation.
+
+    In float32 a plain sum over a million samples would lose its last digits, and compensating each sample costs a tenth
+    of the whole simulation. The samples that fill up the last part are not measured.
+    """
+    count = len(jax.tree.leaves(samples)[0])
+    parts = -(-count // _SUMMED_TOGETHER)
+    length = -(-count // parts)
+
+    def by_part(leaf):
+        filled = jnp.pad(leaf, [(0, parts * length - count)] + [(0, 0)] * (leaf.ndim - 1))
+        return filled.reshape(parts, length, *leaf.shape[1:])
+
+    def one_part(carry, samples):
+        state, total, lost = carry
+        (state, part), _ = lax.scan(body, (state, jnp.zeros_like(total)), samples)
+        # Kahan (1965): what the last addition lost is taken off the next term.
+        term = part - lost
+        following = total + term
+        return (state, following, (following - total) - term), None
+
+    state, total = carry
+    (state, total, _), _ = kernels.scan(one_part, (state, total, jnp.zeros_like(total)), jax.tree.map(by_part, samples))
+    return (state, total), None
 
 
 def robust_square(standardised: Float[Array, "..."], huber: float | None) -> Float[Array, "..."]:
@@ -261,7 +283,7 @@ def huber_weight(standardised: Float[Array, "..."], huber: float | None) -> Floa
     return huber / jnp.maximum(jnp.abs(standardised), huber)
 
 
-def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest):
+def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest, scan=kernels.scan):
     return scan_model(
         problem.equations._replace(stepper=_stored_once(problem.equations.stepper)),
         problem.grid,
@@ -273,7 +295,7 @@ def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry,
         visit,
         carry,
         rest,
-        kernels.scan,
+        scan,
     )
 
 

@@ -57,7 +57,7 @@ def _assert_same(a, b):
 @pytest.mark.parametrize(
     ("make_model", "make_record"), [(ehsvjax.van_der_pol, _record), (ehsvjax.servovalve, _valve_record)]
 )
-@pytest.mark.parametrize("count", [16, 33])
+@pytest.mark.parametrize("count", [2, 5, 16, 33, 70])
 def test_cost_is_the_same_to_the_last_bit(make_model, make_record, count):
     problem = cast(problem_of(make_model(), [make_record()]), jnp.float32)
     individuals = jax.random.uniform(jax.random.key(1), (count, problem.unknowns))

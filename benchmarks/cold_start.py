@@ -1,0 +1,99 @@
+"""From a fresh process to the first identified parameters: import, trace, compile, run; and again with JAX's cache.
+
+    python benchmarks/cold_start.py [--repeats 3] [--out out/benchmarks]
+
+What is identified is a row of the paper's table 1: the Van der Pol oscillator, population 100, 50 generations, search
+and refinement. Every process is new; the second of each pair finds the first one's compiled programs in a cache folder.
+"""
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import common
+
+STAGES = ("import", "trace", "compile", "cache", "run", "total")
+
+PROCESS = """
+import time
+began = time.perf_counter()
+import json, sys
+import numpy as np
+import jax
+import ehsvjax
+imported = time.perf_counter()
+
+spent = {"trace": 0.0, "compile": 0.0, "cache": 0.0}
+kinds = {"/jax/core/compile/jaxpr_trace_duration": "trace",
+         "/jax/core/compile/jaxpr_to_mlir_module_duration": "trace",
+         "/jax/core/compile/backend_compile_duration": "compile"}
+nested = []
+
+def listen(name, duration, **_):
+    if name == "/jax/compilation_cache/cache_retrieval_time_sec":
+        spent["cache"] += duration
+    if name in kinds:
+        spent[kinds[name]] += duration
+
+jax.monitoring.register_event_duration_secs_listener(listen)
+with np.load(sys.argv[1]) as data:
+    record = ehsvjax.Record(data["time"], {"command": data["command"]}, {"position": data["position"]})
+before = time.perf_counter()
+fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=100, generations=50)
+done = time.perf_counter()
+total = time.perf_counter() - began
+print(json.dumps({"import": imported - began, **spent, "identify": done - before, "total": total,
+                  "parameters": fit.parameters}))
+"""
+
+
+def one_process(data: Path, cache: Path | None) -> dict:
+    """Return the seconds of each stage of one fresh process."""
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[1])}
+    if cache is not None:
+        # Programs of any compile time and size are stored: by default JAX keeps those that took over a second.
+        environment |= {
+            "JAX_COMPILATION_CACHE_DIR": str(cache),
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+        }
+    printed = subprocess.run(
+        [sys.executable, "-c", PROCESS, str(data)], env=environment, capture_output=True, text=True, check=True
+    ).stdout
+    stages = json.loads(printed.splitlines()[-1])
+    # With a cache, fetching counts as compiling in JAX's own events; the run is what is left.
+    stages["compile"] -= stages["cache"]
+    stages["run"] = stages["total"] - sum(stages[name] for name in ("import", "trace", "compile", "cache"))
+    return stages
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
+    options = parser.parse_args()
+    import numpy as np
+
+    case = common.cases()["van_der_pol"]
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder) / "record.npz"
+        record = case.record
+        np.savez(data, time=record.time, command=record.inputs["command"], position=record.outputs["position"])
+        measured: dict[str, list[dict]] = {"without a cache": [], "cache, first": [], "cache, second": []}
+        for repeat in range(options.repeats):
+            cache = Path(folder) / f"cache_{repeat}"
+            measured["without a cache"].append(one_process(data, None))
+            measured["cache, first"].append(one_process(data, cache))
+            measured["cache, second"].append(one_process(data, cache))
+        for name, runs in measured.items():
+            rows.append({"process": name} | {stage: statistics.median(r[stage] for r in runs) for stage in STAGES})
+    common.report(rows, options.out, "cold_start", f"Seconds from a fresh process, medians of {options.repeats}")
+
+
+if __name__ == "__main__":
+    main()

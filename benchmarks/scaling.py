@@ -1,0 +1,164 @@
+"""How time and memory grow: population x steps x devices, and a million steps.
+
+    python benchmarks/scaling.py [--repeats 7] [--out out/benchmarks]
+
+The time of the population's cost against the population and against the length of the record, with the deviation from
+proportional growth; on one device and on all; the Jacobian and the gradient in multiples of one simulation; the most
+memory that a process needs for the cost of 4,096 individuals over a million integration steps.
+"""
+
+import argparse
+import functools
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import common
+import jax
+import jax.numpy as jnp
+import matplotlib
+from matplotlib.figure import Figure
+
+from ehsvjax.population import population_cost, residuals, shared_cost
+from ehsvjax.refine import cost_gradient_information
+
+matplotlib.use("Agg")
+
+POPULATIONS = (64, 256, 1024, 4096, 16384)
+LENGTHS = (0.25, 0.5, 1.0)
+
+
+def growth(names, repeats: int) -> list[dict]:
+    """Return the time of the cost for every population, part of the record, and one or all devices."""
+    rows = []
+    everywhere = jax.jit(shared_cost(tuple(jax.devices())))
+    for part in LENGTHS:
+        for name, case in common.cases(part).items():
+            if name not in names:
+                continue
+            for population in POPULATIONS:
+                individuals = common.individuals(case, population)
+                calls = {1: functools.partial(jax.jit(population_cost), case.problem, individuals)}
+                if len(jax.devices()) > 1:
+                    calls[len(jax.devices())] = functools.partial(everywhere, case.problem, individuals)
+                for devices, taken in common.medians(calls, repeats).items():
+                    rows.append(
+                        {
+                            "model": name,
+                            "devices": devices,
+                            "individuals": population,
+                            "steps": case.steps,
+                            "ms": 1e3 * taken,
+                            "ns/step": 1e9 * taken / population / case.steps,
+                        }
+                    )
+                    print(
+                        f"{name} {rows[-1]['steps']} steps x {population} on {devices}: {rows[-1]['ms']:.3g} ms",
+                        flush=True,
+                    )
+    return rows
+
+
+def derivatives(names, repeats: int) -> list[dict]:
+    """Return the Jacobian of all residuals and the gradient of the cost, in multiples of one simulation."""
+    rows = []
+    for name, case in common.cases().items():
+        if name not in names:
+            continue
+        problem, count = case.problem, len(case.problem.free)
+        point = common.individuals(case, 1)[0]
+
+        def of_parameters(problem, parameters, point=point, count=count):
+            return residuals(problem, jnp.concatenate([parameters, point[count:]]))
+
+        simulation = functools.partial(jax.jit(residuals), problem, point)
+        jacobian = functools.partial(jax.jit(jax.jacfwd(of_parameters, argnums=1)), problem, point[:count])
+        cost = functools.partial(jax.jit(lambda p, x: population_cost(p, x[None])[0]), problem, point)
+        forward = functools.partial(jax.jit(cost_gradient_information), problem, point)
+        reverse = functools.partial(jax.jit(jax.grad(lambda x, p: population_cost(p, x[None])[0])), point, problem)
+        calls = {"simulation": simulation, "jacobian": jacobian, "cost": cost, "forward": forward, "reverse": reverse}
+        times = common.medians(calls, repeats)
+        rows.append(
+            {
+                "model": name,
+                "simulation ms": 1e3 * times["simulation"],
+                f"Jacobian by the {'parameters'}, simulations": times["jacobian"] / times["simulation"],
+                "cost, gradient and information, forward, costs": times["forward"] / times["cost"],
+                "gradient by jax.grad (reverse), costs": times["reverse"] / times["cost"],
+            }
+        )
+    return rows
+
+
+MILLION = """
+import resource, sys
+sys.path[:0] = [sys.argv[1], sys.argv[1] + "/benchmarks"]
+import common, jax
+import jax.numpy as jnp
+from dataclasses import replace
+from ehsvjax.population import Samples, population_cost
+case = common.cases()["van_der_pol"]
+problem = case.problem
+count = 1_000_000 // problem.grid.substeps
+repeats = -(-count // problem.samples.inputs.shape[1])
+long = lambda leaf: jnp.tile(leaf, (1, repeats, 1))[:, :count]
+s = problem.samples
+problem = replace(problem, samples=Samples(long(s.inputs), long(s.outputs), long(s.measured), s.sample_period))
+cost = jax.jit(population_cost)(problem, common.individuals(case, 4096))
+assert bool(jnp.all(jnp.isfinite(cost)))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+def memory() -> float:
+    """Return the most memory, MiB, of a process that costs 4,096 individuals over 1,000,000 integration steps."""
+    root = str(Path(__file__).parents[1])
+    printed = subprocess.run([sys.executable, "-c", MILLION, root], capture_output=True, text=True, check=True).stdout
+    return int(printed.split()[-1]) / 1024
+
+
+def picture(table) -> Figure:
+    """Draw the time of an individual and step against the population, a line for each length and number of devices."""
+    figure = Figure(figsize=(8, 3.6), layout="constrained")
+    names = list(table["model"].unique())
+    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        for (devices, steps), rows in table[table["model"] == name].groupby(["devices", "steps"]):
+            style = "-" if devices == 1 else "--"
+            axes.plot(
+                rows["individuals"], rows["ns/step"], style, marker="o", label=f"{steps} steps, {devices} devices"
+            )
+        axes.set(xscale="log", xlabel="individuals", ylabel="ns per individual and step", title=name, ylim=(0, None))
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=7)
+    return figure
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--models", nargs="+", default=["van_der_pol", "servovalve"])
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
+    options = parser.parse_args()
+    common.one_device_per_core()
+    table = common.report(growth(options.models, options.repeats), options.out, "scaling", "Growth of the cost")
+    full = table[(table["individuals"] >= 1024)]
+    for (name, devices), rows in full.groupby(["model", "devices"]):
+        spread = rows["ns/step"].max() / rows["ns/step"].min()
+        print(f"{name}, {devices} devices, 1,024 individuals and more: ns/step within {100 * (spread - 1):.0f}%")
+    if len(jax.devices()) > 1:
+        pivot = full.pivot_table(index=["model", "steps", "individuals"], columns="devices", values="ms")
+        gain = pivot[1] / pivot[len(jax.devices())]
+        print(
+            f"{len(jax.devices())} devices, 1,024 individuals and more: {gain.min():.2f} to {gain.max():.2f} times one"
+        )
+    rows = derivatives(options.models, options.repeats)
+    common.report(rows, options.out, "derivatives", "Derivatives in multiples of what they are of, float32")
+    most = memory()
+    print(f"4,096 individuals over 1,000,000 steps: {most:.0f} MiB at most, the interpreter and JAX included")
+    (options.out / "memory.json").write_text(json.dumps({"MiB": most}))
+    picture(table).savefig(options.out / "scaling.png", dpi=120)
+
+
+if __name__ == "__main__":
+    main()
