@@ -85,8 +85,11 @@ def medians(functions: dict[str, Callable[[], object]], repeats: int) -> dict[st
     for _ in range(repeats):
         for name, function in functions.items():
             time.sleep(0.02)
-            function()
-            taken = seconds(lambda name=name, function=function: [function() for _ in range(calls[name])])
+            jax.block_until_ready(function())
+            began = time.perf_counter()
+            for _ in range(calls[name]):
+                jax.block_until_ready(function())
+            taken = time.perf_counter() - began
             times[name].append(taken / calls[name])
     return {name: statistics.median(values) for name, values in times.items()}
 
