@@ -9,7 +9,7 @@ package's own loops alone and without a compiler flag:
 - `stored_once` cuts a step at the values that several of its results need, and has each computed and stored once.
 
 Measured for 1,024 individuals on one core with AVX2, ns per individual and integration step: servovalve 23 as XLA
-compiles it by default, 11 in one kernel, 3.8 with shared values stored too; Van der Pol 5.8, 1.4 and 1.0.
+compiles it by default, 11 in one kernel, 3.5 with shared values stored too; Van der Pol 5.8, 1.4 and 0.9.
 
 On other platforms, and where a model uses an operation that such a function cannot hold (a sort, a matrix
 decomposition), everything here is the identity.
