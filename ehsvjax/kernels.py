@@ -37,17 +37,17 @@ _STORED_TOGETHER = 32
 # differently, and round differently in the last bit.
 VECTOR = 16
 
-# Primitives that XLA compiles inside one function. A sort, a scatter, or a call of a library cannot be there.
+# Primitives that XLA compiles inside one function. A sort, a scatter, or a call of a library cannot be there, nor can
+# sums and matrix products, which XLA may hand to a library if they are large enough.
 _COMPILED_INSIDE = frozenset(
     """
     abs acos acosh add and argmax argmin asin asinh atan atan2 atanh bitcast_convert_type broadcast_in_dim
     broadcast_to cbrt ceil clamp closed_call clz complex concatenate cond conj convert_element_type copy cos cosh
-    custom_jvp_call custom_vjp_call digamma div dot_general dynamic_slice dynamic_update_slice eq erf erf_inv erfc
-    exp exp2 expm1 floor gather ge gt imag integer_pow iota is_finite jit le lgamma log log1p logistic lt max min
-    mul ne neg nextafter not or pad pow real reduce_and reduce_max reduce_min reduce_or reduce_precision reduce_prod
-    reduce_sum rem reshape rev round rsqrt scan select_n shift_left shift_right_arithmetic shift_right_logical sign
-    sin sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh tile transpose unstack while
-    xla_metadata_value xor
+    custom_jvp_call custom_vjp_call digamma div dynamic_slice dynamic_update_slice eq erf erf_inv erfc exp exp2
+    expm1 floor gather ge gt imag integer_pow iota is_finite jit le lgamma log log1p logistic lt max min mul ne neg
+    nextafter not or pad pow real reduce_and reduce_or reduce_precision rem reshape rev round rsqrt scan select_n
+    shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square squeeze stack
+    stop_gradient sub tan tanh tile transpose unstack while xla_metadata_value xor
     """.split()  # noqa: SIM905, a list would take a line for each
 )
 _FREE = frozenset(("broadcast_in_dim", "convert_element_type", "copy", "reshape", "squeeze", "stack"))
@@ -79,8 +79,8 @@ def _outlined(compiled: Callable, **marks: str) -> Callable:
     return lambda *args: set_xla_metadata(compiled(*args), inlineable="false", **marks)
 
 
-def in_blocks(function: Callable, rows: Float[Array, "individual parameter"]) -> Float[Array, " individual"]:
-    """Apply a function that treats rows alike, `[n, parameter] -> [n]`, in blocks that stay in the cache, one kernel.
+def in_blocks(function: Callable, rows: Float[Array, "individual parameter"]) -> Float[Array, "individual ..."]:
+    """Apply a function that treats rows alike, `[n, parameter] -> [n, ...]`, in blocks that stay in the cache.
 
     The last row is repeated to fill the last block.
     """
@@ -93,7 +93,8 @@ def in_blocks(function: Callable, rows: Float[Array, "individual parameter"]) ->
     if blocks == 1:
         return one_kernel(function)(rows)[:count]
     kernel = one_kernel(lambda blocks: lax.map(function, blocks))
-    return kernel(rows.reshape(blocks, width, -1)).reshape(-1)[:count]
+    results = kernel(rows.reshape(blocks, width, -1))
+    return results.reshape(blocks * width, *results.shape[2:])[:count]
 
 
 def filled_up(rows: Float[Array, "individual parameter"], multiple: int) -> Float[Array, "filled parameter"]:

@@ -182,11 +182,10 @@ def population_cost(problem: Problem, individuals: Float[Array, "individual para
 
     def cost(individual):
         parameters, initial = _split(problem, individual)
-        per_record = jax.vmap(functools.partial(_record_cost, problem, parameters))
-        total = jnp.sum(per_record(initial, problem.samples))
-        return jnp.where(jnp.isnan(total), jnp.inf, total)
+        return jax.vmap(functools.partial(_record_cost, problem, parameters))(initial, problem.samples)
 
-    return kernels.in_blocks(jax.vmap(cost), individuals)
+    total = jnp.sum(kernels.in_blocks(jax.vmap(cost), individuals), axis=1)
+    return jnp.where(jnp.isnan(total), jnp.inf, total)
 
 
 @functools.cache
