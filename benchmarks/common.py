@@ -65,6 +65,12 @@ def individuals(case: Case, count: int) -> jax.Array:
     return 0.25 + 0.5 * jax.random.uniform(jax.random.key(count), (count, case.problem.unknowns))
 
 
+def on_all(tree):
+    """Return the arrays placed on every device, where a search has them from its first generation on."""
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("device",))
+    return jax.device_put(tree, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec()))
+
+
 def seconds(function: Callable[[], object]) -> float:
     """Time one call, its result ready."""
     began = time.perf_counter()

@@ -127,7 +127,10 @@ def contenders(name: str, case: common.Case) -> dict:
     }
     if name == "van_der_pol":
         if importlib.util.find_spec("diffrax"):
-            found |= by("evosax", "evosax SimpleGA, diffrax", peers.evosax_ga, peers.diffrax_cost(case))
+            # Heun's method is of second order, of 2 stages where Runge-Kutta has 4; Tsit5 of fifth, of 6.
+            for solver in ("Heun", "Tsit5"):
+                cost = peers.diffrax_cost(case, solver)
+                found |= by("evosax", f"evosax SimpleGA, diffrax {solver}", peers.evosax_ga, cost)
         found |= by("scipy", "SciPy DE, NumPy over population", peers.differential_evolution, peers.numpy_cost(case))
         found |= by("scipy", "SciPy DE, odeint in a loop", peers.differential_evolution, peers.odeint_cost(case))
     return found

@@ -96,8 +96,8 @@ def evosax_ga(cost: Callable[[jax.Array], jax.Array], unknowns: int, population:
     return step, lambda: held[2]
 
 
-def diffrax_cost(case) -> Callable[[jax.Array], jax.Array]:
-    """Return the Van der Pol cost of a population by diffrax, Heun's method at the same step, vmapped; to be traced."""
+def diffrax_cost(case, solver: str) -> Callable[[jax.Array], jax.Array]:
+    """Return the Van der Pol cost of a population by diffrax, by a solver at the same step, vmapped; to be traced."""
     import diffrax
 
     problem, record = case.problem, case.record
@@ -112,8 +112,9 @@ def diffrax_cost(case) -> Callable[[jax.Array], jax.Array]:
     def one(individual):
         values = to_values(problem.coordinates, individual)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), diffrax.Heun(), times[0], times[-1], period / problem.grid.substeps, values[2:],
-            args=values, saveat=diffrax.SaveAt(ts=times), stepsize_controller=diffrax.ConstantStepSize(),
+            diffrax.ODETerm(field), getattr(diffrax, solver)(), times[0], times[-1],
+            period / problem.grid.substeps, values[2:], args=values,
+            saveat=diffrax.SaveAt(ts=times), stepsize_controller=diffrax.ConstantStepSize(),
             max_steps=len(record) * problem.grid.substeps + 16,
         )  # fmt: skip
         cost = jnp.sum((measured - solution.ys[:, 0]) ** 2) / problem.noise_variance[0]

@@ -12,7 +12,6 @@ from numbers import Integral, Real
 import jax
 import numpy as np
 from jaxtyping import Float64, Num, PRNGKeyArray
-from scipy import signal
 
 Signal = Float64[np.ndarray, " time"]
 
@@ -132,6 +131,8 @@ def chirp(
         _require_resolved(name, frequency, sample_period)
     if method not in ("linear", "logarithmic"):
         raise ValueError(f"expected method to be 'linear' or 'logarithmic', got {method!r}; choose one")
+    from scipy import signal  # half of this package's import time, if it were imported with it
+
     sweep = signal.chirp(times, start_frequency, duration, stop_frequency, method=method, phi=-90.0)
     return amplitude * sweep
 

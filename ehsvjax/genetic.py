@@ -4,6 +4,7 @@ It searches the unit cube; what the coordinates and the cost mean is not known h
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ehsvjax import draws
 from ehsvjax.operators import (
     Crossover,
     Mutation,
@@ -94,10 +96,9 @@ def init(
     A Latin hypercube puts one individual into each of `population` equal slices of every unknown's interval, so that a
     small population leaves no part of any interval unvisited (McKay, Beckman & Conover 1979).
     """
-    key, shuffle_key, place_key = jax.random.split(key, 3)
-    slices = jnp.tile(jnp.arange(population, dtype=dtype)[:, None], (1, unknowns))
-    slices = jax.random.permutation(shuffle_key, slices, axis=0, independent=True)
-    within = jax.random.uniform(place_key, (population, unknowns), dtype)
+    key, place_key = draws.split(key, 2)
+    shuffle, within = draws.uniform(place_key, (2, population, unknowns), dtype)
+    slices = jnp.argsort(shuffle, axis=0).astype(dtype)
     state = State(
         key=key,
         generation=jnp.int32(0),
@@ -125,7 +126,7 @@ def generation(
         tolerance: stop when the lower quartile of the costs lies within this of the best; 0 never stops.
 
     """
-    key, elitism_key, selection_key, crossover_key, mutation_key, immigrant_key = jax.random.split(state.key, 6)
+    key, elitism_key, selection_key, crossover_key, mutation_key, immigrant_key = draws.split(state.key, 6)
     count = len(state.candidates)
 
     population, costs = state.candidates, finite_or_inf(cost(state.candidates))
@@ -147,7 +148,7 @@ def generation(
         elite_cost=elite_cost,
         population=population,
         cost=costs,
-        converged=jnp.quantile(costs, 0.25, method="higher") - elite_cost[0] < tolerance,
+        converged=jnp.sort(costs)[math.ceil(0.25 * (count - 1))] - elite_cost[0] < tolerance,
     )
 
 
@@ -186,7 +187,7 @@ def run(
         state = generation(cost, operators, state, generations, tolerance)
         return state, History(
             best_cost=history.best_cost.at[k].set(state.elite_cost[0]),
-            median_cost=history.median_cost.at[k].set(jnp.median(state.cost)),
+            median_cost=history.median_cost.at[k].set(median(state.cost)),
             failed=history.failed.at[k].set(jnp.mean(jnp.isinf(state.cost), dtype=state.cost.dtype)),
             spread=history.spread.at[k].set(spread(state.population, state.cost)),
             best=history.best.at[k].set(state.elites[0]),
@@ -211,6 +212,12 @@ def best_distinct(
         if all(np.max(np.abs(population[i] - population[j])) > distance for j in apart):
             apart.append(i)
     return (apart + [i for i in order if i not in apart])[:count]
+
+
+def median(cost: Float[Array, " individual"]) -> Float[Array, ""]:
+    """Return the median; unlike `jnp.median` it looks for no NaN, which takes as long to compile again."""
+    ordered, count = jnp.sort(cost), len(cost)
+    return 0.5 * (ordered[(count - 1) // 2] + ordered[count // 2])
 
 
 def spread(population: Float[Array, "individual parameter"], cost: Float[Array, " individual"]) -> Float[Array, ""]:

@@ -1,6 +1,7 @@
 """The recipe: search by the genetic algorithm, refine the best few by gradient, return the fit."""
 
 import os
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -89,6 +90,7 @@ def identify(
     model = model.with_bounds(bounds, fixed)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
 
+    compiling = _compile_refinement(problem, starts, population) if refine else None
     found, history = search(
         Partial(cost, cast(problem, jnp.float32)),
         key,
@@ -103,17 +105,18 @@ def identify(
         checkpoint=checkpoint,
     )
     effort = _search_effort(found, generations)
-    individual = np.asarray(found.elites[0], np.float64)
-    if refine:
+    individual = np.asarray(found.elites, np.float64)[0]
+    if compiling is not None:
+        compiling.join()
         candidates = _candidates(problem, model, found, starts)
         refined, agreeing, problem = _refine_and_reweigh(problem, candidates, reweigh=noise_variance is None)
         individual, effort = _best_of(refined, agreeing, effort)
     elif noise_variance is None:
-        problem = replace(problem, noise_variance=_residual_variance(problem, individual))
+        problem = replace(problem, noise_variance=_residual_variance(problem, _residuals_of(problem, individual)))
     return _fit(model, records, problem, individual, history, effort)
 
 
-_to_values, _to_unit, _residuals = jax.jit(to_values), jax.jit(to_unit), jax.jit(residuals)
+_residuals = jax.jit(residuals)
 
 
 def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
@@ -184,6 +187,17 @@ def _search_effort(found: genetic.State, generations: int) -> Effort:
     )
 
 
+def _compile_refinement(problem: Problem, starts: int, population: int) -> threading.Thread:
+    """Trace the refinement, and have it compiled while the search is traced and compiled, on another core."""
+    count = min(starts, population) + bool(problem.free_initial)
+    with jax.enable_x64(True):
+        traced = refine_starts.lower(cast(problem, jnp.float64), jnp.zeros((count, problem.unknowns)))
+    # What is compiled is kept by the traced program itself, of which JAX keeps one for the same shapes.
+    thread = threading.Thread(target=traced.compile)
+    thread.start()
+    return thread
+
+
 def _candidates(
     problem: Problem, model: Model, found: genetic.State, starts: int
 ) -> Float[np.ndarray, "individual parameter"]:
@@ -210,8 +224,7 @@ def _with_nominal_initial(problem: Problem, model: Model, individual) -> Float[n
     )  # fmt: skip
     count = len(problem.free)
     values[count:] = np.tile(nominal, len(problem.samples.inputs))
-    with jax.enable_x64(True):
-        unit = np.asarray(_to_unit(problem.coordinates, values))
+    unit = to_unit(problem.coordinates, values)
     changed = np.array(individual, float)
     changed[count:] = np.where(np.isnan(unit[count:]), 0.5, np.clip(unit[count:], 0.0, 1.0))
     return changed
@@ -231,14 +244,14 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
             return refined, agreeing, problem
         several = len(problem.observed) > 1 or problem.huber is not None
         for _ in range(10 if several else 1):
-            best = refined.individual[np.argmin(refined.cost)]
-            variance = _residual_variance(problem, best)
+            best = np.argmin(refined.cost)
+            variance = _residual_variance(problem, refined.residuals[best])
             settled = np.allclose(variance, problem.noise_variance, rtol=0.01)
             problem = replace(problem, noise_variance=variance)
             if settled or not several:
                 break
             # From the best alone, as often as there were starts: the same shape is not compiled again.
-            again = np.broadcast_to(best, refined.individual.shape)
+            again = np.broadcast_to(refined.individual[best], refined.individual.shape)
             refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(again)))
         return refined, agreeing, problem
 
@@ -247,10 +260,15 @@ def _in_numpy(refined: Refined) -> Refined:
     return jax.tree.map(np.array, refined)
 
 
-def _residual_variance(problem: Problem, individual) -> Float[np.ndarray, " signal"]:
-    """Return the mean square of each output's residuals; with a Huber cost from their median size, robust to spikes."""
+def _residuals_of(problem: Problem, individual) -> Float[np.ndarray, "record time signal"]:
     with jax.enable_x64(True):
-        standardised = np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
+        return np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
+
+
+def _residual_variance(
+    problem: Problem, standardised: Float[np.ndarray, "record time signal"]
+) -> Float[np.ndarray, " signal"]:
+    """Return the mean square of each output's residuals; with a Huber cost from their median size, robust to spikes."""
     variances = []
     for i, variance in enumerate(problem.noise_variance):
         measured = standardised[..., i][problem.samples.measured[..., i]]
@@ -293,8 +311,7 @@ def _fit(model, records, problem: Problem, individual, history: genetic.History,
 
 
 def _values(problem: Problem, individual) -> Float[np.ndarray, " *batch parameter"]:
-    with jax.enable_x64(True):
-        return np.array(_to_values(problem.coordinates, np.asarray(individual, np.float64)))
+    return to_values(problem.coordinates, np.asarray(individual, np.float64))
 
 
 def _initial_by_record(model: Model, problem: Problem, individual) -> list[dict[str, float]]:

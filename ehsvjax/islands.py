@@ -130,7 +130,7 @@ def _recorded(state: State, history: History, k: Int[Array, ""]) -> History:
     winner = jnp.argmin(best_cost)
     return History(
         best_cost=history.best_cost.at[k].set(best_cost[winner]),
-        median_cost=history.median_cost.at[k].set(jnp.median(cost)),
+        median_cost=history.median_cost.at[k].set(genetic.median(cost.ravel())),
         failed=history.failed.at[k].set(jnp.mean(jnp.isinf(cost), dtype=cost.dtype)),
         spread=history.spread.at[k].set(spread),
         best=history.best.at[k].set(best[winner]),

@@ -44,10 +44,11 @@ _COMPILED_INSIDE = frozenset(
     abs acos acosh add and argmax argmin asin asinh atan atan2 atanh bitcast_convert_type broadcast_in_dim
     broadcast_to cbrt ceil clamp closed_call clz complex concatenate cond conj convert_element_type copy cos cosh
     custom_jvp_call custom_vjp_call digamma div dynamic_slice dynamic_update_slice eq erf erf_inv erfc exp exp2
-    expm1 floor gather ge gt imag integer_pow iota is_finite jit le lgamma log log1p logistic lt max min mul ne neg
-    nextafter not or pad pow real reduce_and reduce_or reduce_precision rem reshape rev round rsqrt scan select_n
-    shift_left shift_right_arithmetic shift_right_logical sign sin sinh slice split sqrt square squeeze stack
-    stop_gradient sub tan tanh tile transpose unstack while xla_metadata_value xor
+    expm1 floor gather ge gt imag integer_pow iota is_finite jit le lgamma log log1p logistic lt max min mul ne
+    neg nextafter not or pad pow random_bits random_split random_unwrap random_wrap real reduce_and reduce_or
+    reduce_precision rem reshape rev round rsqrt scan select_n shift_left shift_right_arithmetic
+    shift_right_logical sign sin sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh tile
+    transpose unstack while xla_metadata_value xor
     """.split()  # noqa: SIM905, a list would take a line for each
 )
 _FREE = frozenset(("broadcast_in_dim", "convert_element_type", "copy", "reshape", "squeeze", "stack"))

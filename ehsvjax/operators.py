@@ -17,9 +17,10 @@ import math
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
+
+from ehsvjax import draws
 
 Population = Float[Array, "individual parameter"]
 Progress = Float[Array, ""] | float
@@ -60,7 +61,7 @@ def blend_crossover(extent: float = 0.5) -> Crossover:
     _check(0 <= extent <= 1, "extent", "from 0 to 1 (0.5 is usual)", extent)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
-        weights = jax.random.uniform(key, mothers.shape, mothers.dtype, -extent, 1 + extent)
+        weights = draws.uniform(key, mothers.shape, mothers.dtype, -extent, 1 + extent)
         return _reflect(mothers + weights * (fathers - mothers))
 
     return crossover
@@ -78,7 +79,7 @@ def line_crossover(extent: float = 0.25) -> Crossover:
     _check(0 <= extent <= 1, "extent", "from 0 to 1 (0.25 is usual)", extent)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
-        weights = jax.random.uniform(key, (len(mothers), 1), mothers.dtype, -extent, 1 + extent)
+        weights = draws.uniform(key, (len(mothers), 1), mothers.dtype, -extent, 1 + extent)
         return _reflect(mothers + weights * (fathers - mothers))
 
     return crossover
@@ -98,14 +99,13 @@ def simulated_binary_crossover(distribution_index: float = 2.0, probability: flo
     _check(0 <= probability <= 1, "probability", "from 0 to 1", probability)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
-        key_child, key_parameter, key_spread = jax.random.split(key, 3)
-        first_child = jax.random.bernoulli(key_child, shape=(len(mothers), 1))
+        key_child, key_parameters = draws.split(key, 2)
+        first_child = draws.uniform(key_child, (len(mothers), 1)) < 0.5
         near, far = jnp.where(first_child, mothers, fathers), jnp.where(first_child, fathers, mothers)
-        uniform = jax.random.uniform(key_spread, mothers.shape, mothers.dtype)
+        part, uniform = draws.uniform(key_parameters, (2, *mothers.shape), mothers.dtype)
         power = jnp.where(uniform <= 0.5, 2 * uniform, 1 / (2 * (1 - uniform)))
         spread = power ** (1 / (distribution_index + 1))
-        takes_part = jax.random.bernoulli(key_parameter, probability, mothers.shape)
-        return _reflect(near + jnp.where(takes_part, (1 - spread) / 2, 0) * (far - near))
+        return _reflect(near + jnp.where(part < probability, (1 - spread) / 2, 0) * (far - near))
 
     return crossover
 
@@ -123,7 +123,7 @@ def differential_crossover(weight: float = 0.5) -> Crossover:
     _check(0 < weight <= 1, "weight", "above 0 and at most 1 (0.5 is usual)", weight)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
-        share = jax.random.uniform(key, (len(mothers), 1), mothers.dtype, 0.5 * weight, 1.5 * weight)
+        share = draws.uniform(key, (len(mothers), 1), mothers.dtype, 0.5 * weight, 1.5 * weight)
         return _reflect(mothers + share * (fathers - jnp.roll(fathers, 1, axis=0)))
 
     return crossover
@@ -146,11 +146,10 @@ def gaussian_mutation(
     _check(probability is None or 0 <= probability <= 1, "probability", "None or from 0 to 1", probability)
 
     def mutation(key: Key[Array, ""], individuals: Population, progress: Progress) -> Population:
-        key_parameter, key_step = jax.random.split(key)
+        which, uniform = draws.uniform(key, (2, *individuals.shape), individuals.dtype)
         deviation_now = deviation * (final / deviation) ** jnp.asarray(progress, individuals.dtype)
-        steps = deviation_now * jax.random.normal(key_step, individuals.shape, individuals.dtype)
-        mutates = _which_mutate(key_parameter, individuals, probability)
-        return _reflect(individuals + jnp.where(mutates, steps, 0))
+        steps = deviation_now * draws.normal_from(uniform)
+        return _reflect(individuals + jnp.where(which < _share(probability, individuals), steps, 0))
 
     return mutation
 
@@ -168,12 +167,10 @@ def polynomial_mutation(distribution_index: float = 20.0, probability: float | N
     _check(probability is None or 0 <= probability <= 1, "probability", "None or from 0 to 1", probability)
 
     def mutation(key: Key[Array, ""], individuals: Population, progress: Progress) -> Population:
-        key_parameter, key_step = jax.random.split(key)
-        uniform = jax.random.uniform(key_step, individuals.shape, individuals.dtype)
+        which, uniform = draws.uniform(key, (2, *individuals.shape), individuals.dtype)
         exponent = 1 / (distribution_index + 1)
         steps = jnp.where(uniform < 0.5, (2 * uniform) ** exponent - 1, 1 - (2 * (1 - uniform)) ** exponent)
-        mutates = _which_mutate(key_parameter, individuals, probability)
-        return _reflect(individuals + jnp.where(mutates, steps, 0))
+        return _reflect(individuals + jnp.where(which < _share(probability, individuals), steps, 0))
 
     return mutation
 
@@ -190,7 +187,7 @@ def tournament_selection(size: int = 2) -> Selection:
     _check(size >= 1 and size % 1 == 0, "size", "a whole number of at least 1 (2 is usual)", size)
 
     def selection(key: Key[Array, ""], cost: Float[Array, " individual"], count: int) -> Int[Array, " count"]:
-        rivals = jax.random.randint(key, (count, int(size)), 0, len(cost))
+        rivals = draws.integers(key, (count, int(size)), len(cost))
         winners = jnp.argmin(finite_or_inf(cost)[rivals], axis=1, keepdims=True)
         return jnp.take_along_axis(rivals, winners, axis=1)[:, 0]
 
@@ -269,7 +266,7 @@ def elitism(
     # Of a present elite one copy is kept: if all were, there could be too few places for the absent ones.
     copy = jnp.where(present, same.argmax(axis=1), individuals)
     kept = jnp.zeros(individuals, bool).at[copy].set(True, mode="drop")
-    places = jnp.argsort(jnp.where(kept, 2, jax.random.uniform(key, (individuals,))))
+    places = jnp.argsort(jnp.where(kept, 2, draws.uniform(key, (individuals,))))
     absent = ~present & jnp.isfinite(elite_cost)
     place = jnp.where(absent, places[jnp.cumsum(absent) - 1], individuals)
     return population.at[place].set(elites, mode="drop"), cost.at[place].set(elite_cost, mode="drop")
@@ -284,9 +281,9 @@ def immigrants(key: Key[Array, ""], population: Population, count: int) -> Popul
     """
     individuals, parameters = population.shape
     _check(0 <= count <= individuals, "count", f"from 0 to {individuals} (the number of individuals)", count)
-    key_place, key_value = jax.random.split(key)
-    place = jax.random.permutation(key_place, individuals)[:count]
-    return population.at[place].set(jax.random.uniform(key_value, (count, parameters), population.dtype))
+    uniform = draws.uniform(key, (individuals + count * parameters,), population.dtype)
+    place = jnp.argsort(uniform[:individuals])[:count]
+    return population.at[place].set(uniform[individuals:].reshape(count, parameters))
 
 
 def finite_or_inf(cost: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
@@ -300,11 +297,9 @@ def _reflect(values: Population) -> Population:
     return jnp.minimum(jnp.abs(values - 2 * jnp.round(values / 2)), 1)
 
 
-def _which_mutate(
-    key: Key[Array, ""], individuals: Population, probability: float | None
-) -> Bool[Array, "individual parameter"]:
-    probability = 1 / individuals.shape[1] if probability is None else probability
-    return jax.random.bernoulli(key, probability, individuals.shape)
+def _share(probability: float | None, individuals: Population) -> float:
+    """Return the share of the parameters that mutate."""
+    return 1 / individuals.shape[1] if probability is None else probability
 
 
 def _spin_wheel(key: Key[Array, ""], weights: Float[Array, " individual"], count: int) -> Int[Array, " count"]:
@@ -312,7 +307,7 @@ def _spin_wheel(key: Key[Array, ""], weights: Float[Array, " individual"], count
     weights = jnp.where(weights.any(), weights, 1)
     order = jnp.argsort(-weights)
     cumulative = jnp.cumsum(weights[order])
-    spins = jax.random.uniform(key, (count,), weights.dtype) * cumulative[-1]
+    spins = draws.uniform(key, (count,), weights.dtype) * cumulative[-1]
     positions = jnp.searchsorted(cumulative, spins, side="right")
     return order[jnp.minimum(positions, jnp.count_nonzero(weights) - 1)]
 

@@ -1,7 +1,7 @@
 """Gradient refinement with optax, in the unit cube, until the sum of squares is as good as at its minimum."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ class Refined(NamedTuple):
         cost: its cost, as `population_cost` counts it.
         remaining: by how much the next step would lower the cost, to first order.
         information: `J^T W J` there, J the standardised residuals by the coordinates: the Fisher information.
+        residuals: standardised, there; zero where there is no sample.
         iterations: how many steps were taken.
         converged: whether `remaining` fell below the tolerance.
 
@@ -29,12 +30,16 @@ class Refined(NamedTuple):
     cost: Float[Array, " individual"]
     remaining: Float[Array, " individual"]
     information: Float[Array, "individual parameter parameter"]
+    residuals: Float[Any, "individual record time signal"]
     iterations: Int[Array, " individual"]
     converged: Bool[Array, " individual"]
 
 
 class LevenbergMarquardtState(NamedTuple):
-    """The last point that was accepted, what was measured there, and the damping of the next step from it."""
+    """The last point that was accepted, what was measured there, and the next step from it: its damping and its gain.
+
+    The gain is the decrease of twice the value that the step promises, to first order.
+    """
 
     point: Float[Array, " parameter"]
     value: Float[Array, ""]
@@ -42,6 +47,7 @@ class LevenbergMarquardtState(NamedTuple):
     information: Float[Array, "parameter parameter"]
     damping: Float[Array, ""]
     growth: Float[Array, ""]
+    gain: Float[Array, ""]
 
 
 def levenberg_marquardt(damping: float = 1e-4, shrink: float = 0.1) -> optax.GradientTransformationExtraArgs:
@@ -68,6 +74,7 @@ def levenberg_marquardt(damping: float = 1e-4, shrink: float = 0.1) -> optax.Gra
             information=jnp.eye(size, dtype=params.dtype),
             damping=jnp.asarray(damping / shrink, params.dtype),
             growth=jnp.asarray(2.0, params.dtype),
+            gain=jnp.asarray(jnp.inf, params.dtype),
         )
 
     def update(gradient, state, params, *, value, information, **unused):
@@ -75,10 +82,11 @@ def levenberg_marquardt(damping: float = 1e-4, shrink: float = 0.1) -> optax.Gra
         # Written so that a NaN is not an improvement.
         better = value < state.value
         two = jnp.full_like(state.growth, 2.0)
-        fresh = LevenbergMarquardtState(params, value, gradient, information, state.damping * shrink, two)
+        fresh = LevenbergMarquardtState(params, value, gradient, information, state.damping * shrink, two, state.gain)
         stale = state._replace(damping=state.damping * state.growth, growth=2.0 * state.growth)
         state = jax.tree.map(functools.partial(jnp.where, better), fresh, stale)
         step = gauss_newton_step(state.point, state.gradient, state.information, state.damping)
+        state = state._replace(gain=-jnp.dot(state.gradient, step))
         return jnp.clip(state.point + step, 0.0, 1.0) - params, state
 
     return optax.GradientTransformationExtraArgs(init, update)
@@ -135,54 +143,72 @@ def refine(
         del information
         return 0.5 * population_cost(problem, params[None])[0]
 
-    def refine_one(start):
-        def unfinished(state):
-            *_, best, _, k = state
-            return (k < iterations) & ~best.converged
-
-        def body(state):
-            params, optimizer_state, best, gradient_at_best, k = state
-            cost, gradient, information = cost_gradient_information(problem, params)
-            better = cost < best.cost
-            here = best._replace(individual=params, cost=cost, information=information)
-            best, gradient_at_best = jax.tree.map(
-                functools.partial(jnp.where, better), (here, gradient), (best, gradient_at_best)
-            )
-            updates, optimizer_state = optimizer.update(
-                gradient,
-                optimizer_state,
-                params,
-                value=0.5 * cost,
-                grad=gradient,
-                value_fn=value_fn,
-                information=information,
-            )
-            moved = optax.projections.projection_box(optax.apply_updates(params, updates), 0.0, 1.0)
-            damping = optimizer_state.damping if isinstance(optimizer_state, LevenbergMarquardtState) else 0.0
-            step = gauss_newton_step(best.individual, gradient_at_best, best.information, damping)
-            remaining = -jnp.dot(gradient_at_best, step)
-            enough = tolerance * best.cost / jnp.sum(problem.samples.measured)
-            converged = (remaining <= enough) & jnp.isfinite(best.cost)
-            best = best._replace(remaining=remaining, iterations=k + 1, converged=converged)
-            return moved, optimizer_state, best, gradient_at_best, k + 1
-
+    def start_from(start):
         size = start.shape[0]
         nowhere = Refined(
             individual=start,
             cost=jnp.asarray(jnp.inf, start.dtype),
             remaining=jnp.asarray(jnp.inf, start.dtype),
             information=jnp.zeros((size, size), start.dtype),
+            residuals=jnp.zeros(problem.samples.outputs.shape, start.dtype),
             iterations=jnp.int32(0),
             converged=jnp.bool_(False),
         )
-        state = start, optimizer.init(start), nowhere, jnp.zeros_like(start), jnp.int32(0)
-        return lax.while_loop(unfinished, body, state)[2]
+        return _State(start, optimizer.init(start), nowhere, jnp.zeros_like(start))
 
-    return jax.vmap(refine_one)(starts)
+    def unfinished(state):
+        return (state.best.iterations < iterations) & ~state.best.converged
+
+    def advance(state, measured):
+        cost, gradient, information, r = measured
+        better = cost < state.best.cost
+        here = state.best._replace(individual=state.point, cost=cost, information=information, residuals=r)
+        best, gradient_at_best = jax.tree.map(
+            functools.partial(jnp.where, better), (here, gradient), (state.best, state.gradient_at_best)
+        )
+        updates, optimizer_state = optimizer.update(
+            gradient,
+            state.optimizer_state,
+            state.point,
+            value=0.5 * cost,
+            grad=gradient,
+            value_fn=value_fn,
+            information=information,
+        )
+        point = optax.projections.projection_box(optax.apply_updates(state.point, updates), 0.0, 1.0)
+        if isinstance(optimizer_state, LevenbergMarquardtState):
+            remaining = optimizer_state.gain
+        else:
+            step = gauss_newton_step(best.individual, gradient_at_best, best.information)
+            remaining = -jnp.dot(gradient_at_best, step)
+        enough = tolerance * best.cost / jnp.sum(problem.samples.measured)
+        best = best._replace(
+            remaining=remaining,
+            iterations=state.best.iterations + 1,
+            converged=(remaining <= enough) & jnp.isfinite(best.cost),
+        )
+        following = _State(point, optimizer_state, best, gradient_at_best)
+        return jax.tree.map(functools.partial(jnp.where, unfinished(state)), following, state)
+
+    def body(states):
+        measured = jax.vmap(functools.partial(cost_gradient_information, problem))(states.point)
+        return jax.vmap(advance)(states, measured)
+
+    states = jax.vmap(start_from)(starts)
+    return lax.while_loop(lambda states: jnp.any(unfinished(states)), body, states).best
+
+
+class _State(NamedTuple):
+    """Of one start: the point to be measured next, the optimizer's state, and the best point so far."""
+
+    point: Float[Array, " parameter"]
+    optimizer_state: optax.OptState
+    best: Refined
+    gradient_at_best: Float[Array, " parameter"]
 
 
 def cost_gradient_information(problem: Problem, individual: Float[Array, " parameter"]):
-    """Return the cost, half its gradient and the Gauss-Newton information of one individual.
+    """Return the cost, half its gradient, the Gauss-Newton information and the residuals of one individual.
 
     By forward differentiation: one simulation with a tangent for every unknown, all in one pass. With a Huber cost a
     residual weighs by its derivative over itself (iteratively reweighted least squares).
@@ -198,4 +224,4 @@ def cost_gradient_information(problem: Problem, individual: Float[Array, " param
     weighted = jacobian * weight.reshape(-1, 1)
     gradient = weighted.T @ r.reshape(-1)
     cost = jnp.sum(robust_square(r, problem.huber))
-    return jnp.where(jnp.isnan(cost), jnp.inf, cost), gradient, weighted.T @ jacobian
+    return jnp.where(jnp.isnan(cost), jnp.inf, cost), gradient, weighted.T @ jacobian, r

@@ -88,12 +88,14 @@ def test_errors_are_those_that_the_bound_allows(record):
         noise_variance={"position": 0.05},
         initial_values={"initial_position": 0.3, "initial_velocity": -0.2},
     )
-    fits = [_identified(_oscillator(seed=100 + i), key=jax.random.key(i)) for i in range(30)]
+    # The paper's sizes: what the search alone reaches is a claim about those.
+    sizes = {"population": 100, "generations": 50}
+    fits = [_identified(_oscillator(seed=100 + i), key=jax.random.key(i), **sizes) for i in range(30)]
     for name, true in TRUTH.items():
         statistic = sum(((f.parameters[name] - true) / bound[name]) ** 2 for f in fits)
         assert 10.0 < statistic < 66.0, (name, statistic)  # a false alarm in 1e4
         alone = sum(((f.history.best[name][-1] - true) / bound[name]) ** 2 for f in fits)
-        assert alone < 1.3**2 * 66.0, (name, alone)
+        assert alone < 1.05**2 * 66.0, (name, alone)
 
 
 def test_servovalve_with_two_outputs(valve_record):

@@ -82,6 +82,30 @@ def test_order_of_individuals_does_not_matter():
     np.testing.assert_array_equal(_cost(_problem())[order], _cost(_problem(), INDIVIDUALS[order]))
 
 
+@pytest.mark.parametrize("huber", [None, 1.345])
+@pytest.mark.parametrize("count", [1, 3, 40])
+def test_gradient_is_that_of_finite_differences(count, huber):
+    individuals = np.random.default_rng(count).uniform(0.2, 0.5, (count, 3))
+    with jax.enable_x64(True):
+        problem = cast(_problem(RECORD, RECORD.slice(0.0, 1.5), huber=huber), jnp.float64)
+        gradient = jax.jit(jax.grad(lambda rows: jnp.sum(population_cost(problem, rows))))(jnp.asarray(individuals))
+        for i in range(3):
+            step = 1e-6 * np.eye(3)[i]
+            above, below = (_cost(problem, individuals + sign * step, jnp.float64) for sign in (1, -1))
+            np.testing.assert_allclose(gradient[:, i], (above - below) / 2e-6, rtol=1e-5, atol=1e-4)
+
+
+def test_cost_is_not_differentiated_by_its_data():
+    problem = cast(_problem(), jnp.float32)
+    individuals = jnp.asarray(INDIVIDUALS[:1], jnp.float32)
+
+    def by_variance(variance):
+        return population_cost(dataclasses.replace(problem, noise_variance=variance), individuals)[0]
+
+    with pytest.raises(jax.errors.UnexpectedTracerError):
+        jax.grad(by_variance)(problem.noise_variance)
+
+
 def test_missing_samples_and_padding_weigh_nothing():
     gappy = np.array(RECORD.outputs["level"])
     gappy[20:30] = np.nan
