@@ -79,7 +79,12 @@ def seconds(function: Callable[[], object]) -> float:
 
 
 def medians(functions: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Return the median time of each function, measured in turn, so that what disturbs one disturbs all; s.
+    """Return the median time of each function, measured as `times` does; s."""
+    return {name: statistics.median(values) for name, values in times(functions, repeats).items()}
+
+
+def times(functions: dict, repeats: int) -> dict:
+    """Return the times of each function, measured in turn, so that what disturbs one disturbs all; s.
 
     A measurement is the mean of as many calls in a row as take 30 ms. It begins after a short sleep, in which the
     threads of the one before come to rest: OpenMP's wait actively for a while.
@@ -87,7 +92,7 @@ def medians(functions: dict[str, Callable[[], object]], repeats: int) -> dict[st
     for function in functions.values():
         jax.block_until_ready(function())
     calls = {name: max(1, round(0.03 / seconds(function))) for name, function in functions.items()}
-    times: dict[str, list[float]] = {name: [] for name in functions}
+    taken_by: dict = {name: [] for name in functions}
     for _ in range(repeats):
         for name, function in functions.items():
             time.sleep(0.02)
@@ -96,8 +101,8 @@ def medians(functions: dict[str, Callable[[], object]], repeats: int) -> dict[st
             for _ in range(calls[name]):
                 jax.block_until_ready(function())
             taken = time.perf_counter() - began
-            times[name].append(taken / calls[name])
-    return {name: statistics.median(values) for name, values in times.items()}
+            taken_by[name].append(taken / calls[name])
+    return taken_by
 
 
 def machine() -> str:

@@ -6,6 +6,7 @@ The pipeline, each step usable by itself:
     model = servovalve(...)                          a block diagram with named signals (`models`)
     fit = identify(model, record, key=...)           genetic search and gradient refinement (`identify`)
     print(fit); fit.plot(); fit.score(other_record)  the result (`fit`)
+    fit.precision(); fit.profile_likelihood()        how sure it is (`precision`); before any data: `design`
 
 Axes, wherever a shape is given: record, individual (a candidate of the population), parameter (an unknown, initial
 conditions included), generation, time (a sample), signal (an output). SI units throughout.
@@ -18,7 +19,7 @@ from ehsvjax.genetic import Operators
 from ehsvjax.identify import identify
 from ehsvjax.integrators import runge_kutta_4
 from ehsvjax.models import Model, Parameter, Signal, servovalve, van_der_pol
-from ehsvjax.precision import cramer_rao_bound
+from ehsvjax.precision import cramer_rao_bound, design
 from ehsvjax.record import Record
 from ehsvjax.simulate import simulate
 
@@ -31,6 +32,7 @@ __all__ = [
     "Record",
     "Signal",
     "cramer_rao_bound",
+    "design",
     "excitation",
     "hydraulics",
     "identify",

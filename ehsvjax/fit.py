@@ -4,7 +4,7 @@ import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -12,6 +12,12 @@ from jaxtyping import Float
 from ehsvjax.models.model import Model
 from ehsvjax.record import Record
 from ehsvjax.simulate import simulate
+
+if TYPE_CHECKING:
+    from jaxtyping import Array, Key
+
+    from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
+    from ehsvjax.precision.of_fit import Prepared
 
 
 class Score(NamedTuple):
@@ -92,6 +98,7 @@ class Fit:
         warnings: what a user should know before trusting the numbers; empty if nothing.
         huber: residuals beyond this many standard deviations weigh linearly; None: all are squared.
         estimated_initial: names of the initial conditions that were estimated; the others were known.
+        noise_variance_given: whether the noise variance was given.
 
     """
 
@@ -105,6 +112,7 @@ class Fit:
     warnings: tuple[str, ...]
     huber: float | None = None
     estimated_initial: tuple[str, ...] = ()
+    noise_variance_given: bool = False
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -200,6 +208,108 @@ class Fit:
         from ehsvjax.identify import estimate_initial
 
         return estimate_initial(self, record)
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard deviation of each parameter, SI; +inf for one that the records do not fix. See `precision`."""
+        return self.precision().standard_errors
+
+    @property
+    def correlations(self) -> dict[tuple[str, str], float]:
+        """Correlation of each pair of parameters that the records fix. See `precision`."""
+        return self.precision().correlations
+
+    def precision(self, noise: str = "auto") -> "Precision":
+        """Return how sure the parameters are, to first order: errors, correlations, directions that are not fixed.
+
+        From the Fisher information, with sensitivities by forward differentiation in float64, the initial conditions
+        that were estimated taken into account. Where the noise variance was not given it is that of the residuals.
+
+        Args:
+            noise: "white"; "coloured", for residuals that are correlated (a sandwich with an autoregression of the
+                residuals); or "auto": coloured if a Ljung-Box test says that they are.
+
+        Raises:
+            ValueError: for another noise.
+
+        """
+        from ehsvjax.precision import of_fit
+
+        return of_fit.precision(self, self._prepared(noise))
+
+    def profile_likelihood(
+        self, names: Sequence[str] | None = None, *, level: float = 0.95, noise: str = "auto"
+    ) -> "ProfileLikelihood":
+        """Return intervals by how the best cost rises as a parameter is held elsewhere; all refits run as one batch.
+
+        Slower than standard errors, and right where the cost is no parabola, or where a parameter is near a bound.
+
+        Args:
+            names: of the parameters; by default all that were identified.
+            level: of the intervals.
+            noise: as for `precision`.
+
+        Raises:
+            ValueError: for a parameter that was not identified, a level that is none, or another noise.
+
+        """
+        from ehsvjax.precision import of_fit
+
+        return of_fit.profiles(self, self._prepared(noise), names, level)
+
+    def bootstrap(
+        self, key: "Key[Array, '']", draws: int = 200, *, kind: str = "parametric", noise: str = "auto"
+    ) -> "Bootstrap":
+        """Refit records that are drawn anew from the fit, all in one batch.
+
+        Args:
+            key: random key, `jax.random.key(0)`.
+            draws: how many.
+            kind: "parametric" draws Gaussian noise, "block" puts blocks of the residuals together anew.
+            noise: of the draws, as for `precision`.
+
+        Raises:
+            ValueError: for another kind or noise, or fewer than 2 draws.
+
+        """
+        from ehsvjax.precision import of_fit
+
+        return of_fit.draws(self, self._prepared(noise), key, draws, kind)
+
+    def bands(
+        self,
+        record: Record | None = None,
+        initial: Mapping[str, float] | str = "estimate",
+        *,
+        level: float = 0.95,
+        noise: str = "auto",
+    ) -> dict[str, "Band"]:
+        """Return how far the true output and a new measurement may lie from each simulated output, by its name.
+
+        Args:
+            record: by default the first that was fitted.
+            initial: as for `simulate`; the errors of those that are estimated count.
+            level: of the bands.
+            noise: as for `precision`.
+
+        Raises:
+            ValueError: if the record holds none of the outputs that were fitted.
+
+        """
+        from ehsvjax.precision import of_fit
+
+        return of_fit.bands(self, self._prepared(noise), self.records[0] if record is None else record, initial, level)
+
+    def _prepared(self, noise: str) -> "Prepared":
+        from ehsvjax.precision import of_fit
+
+        if noise not in self._prepared_by_noise:
+            self._prepared_by_noise[noise] = of_fit.prepared(self, noise)
+        return self._prepared_by_noise[noise]
+
+    @functools.cached_property
+    def _prepared_by_noise(self) -> dict[str, "Prepared"]:
+        return {}
 
     def plot(self, record: Record | None = None):
         """Draw measured against simulated, the residual, and the cost by generation; returns the matplotlib figure.

@@ -113,7 +113,7 @@ def identify(
         individual, effort = _best_of(refined, agreeing, effort)
     elif noise_variance is None:
         problem = replace(problem, noise_variance=_residual_variance(problem, _residuals_of(problem, individual)))
-    return _fit(model, records, problem, individual, history, effort)
+    return _fit(model, records, problem, individual, history, effort, noise_variance is not None)
 
 
 _residuals = jax.jit(residuals)
@@ -191,7 +191,8 @@ def _compile_refinement(problem: Problem, starts: int, population: int) -> threa
     """Trace the refinement, and have it compiled while the search is traced and compiled, on another core."""
     count = min(starts, population) + bool(problem.free_initial)
     with jax.enable_x64(True):
-        traced = refine_starts.lower(cast(problem, jnp.float64), jnp.zeros((count, problem.unknowns)))
+        nowhere = np.zeros((count, problem.unknowns))
+        traced = refine_starts.lower(cast(problem, jnp.float64), jnp.asarray(nowhere), held=jnp.asarray(nowhere > 0))
     # What is compiled is kept by the traced program itself, of which JAX keeps one for the same shapes.
     thread = threading.Thread(target=traced.compile)
     thread.start()
@@ -237,7 +238,9 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
     returned says how many starts came to within a tenth of a noise variance of the same minimum, in the first round.
     """
     with jax.enable_x64(True):
-        refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64)))
+        # Nothing is held, but a profile, which does hold something, then finds this program compiled.
+        nothing = jnp.zeros(np.shape(starts), bool)
+        refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
         least = np.min(refined.cost)
         agreeing = int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))
         if not reweigh:
@@ -252,7 +255,7 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
                 break
             # From the best alone, as often as there were starts: the same shape is not compiled again.
             again = np.broadcast_to(refined.individual[best], refined.individual.shape)
-            refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(again)))
+            refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(again), held=nothing))
         return refined, agreeing, problem
 
 
@@ -293,7 +296,9 @@ def _best_of(refined: Refined, agreeing: int, effort: Effort) -> tuple[Float[np.
     )
 
 
-def _fit(model, records, problem: Problem, individual, history: genetic.History, effort: Effort) -> Fit:
+def _fit(
+    model, records, problem: Problem, individual, history: genetic.History, effort: Effort, noise_variance_given: bool
+) -> Fit:
     values = _values(problem, individual)
     parameters = {name: float(v) for name, v in zip(problem.free, values, strict=False)}
     return Fit(
@@ -307,6 +312,7 @@ def _fit(model, records, problem: Problem, individual, history: genetic.History,
         warnings=_warnings(model, problem, individual, effort),
         huber=problem.huber,
         estimated_initial=problem.free_initial,
+        noise_variance_given=noise_variance_given,
     )
 
 

@@ -11,10 +11,13 @@ from jaxtyping import Float
 
 from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
+from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.record import Record
 
 if TYPE_CHECKING:
     import matplotlib.figure
+
+    from ehsvjax.precision import Band, ProfileLikelihood
 
 _MEASURED, _MODEL, _TRUE, _COMMAND, _AXIS = "#9aa5b1", "#c2410c", "#1f2933", "#2563a8", "#616e7c"
 
@@ -42,6 +45,9 @@ _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 
 def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     """Draw each output of a record, measured and simulated, its residual, and the search's cost by generation.
 
+    The residual lies in two bands: the wide one holds 95% of new samples, in the narrow one lies the true output less
+    the model's with 95%, as far as the errors of the parameters go.
+
     Args:
         fit: whose model is simulated.
         record: one that was fitted, or a new one, whose initial conditions are then estimated first.
@@ -54,6 +60,7 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
         raise ValueError(f"expected {record.name} to hold an output to draw, got none: use fit.simulate(record)")
     initial = fit.initial_of(record)
     simulated, score = fit.simulate(record, initial), fit.score(record, initial)
+    bands = fit.bands(record, initial)
     count = len(record.outputs)
     with _style():
         figure = _figure(width=9.0, height=3.4 * count + 2.2)
@@ -64,7 +71,7 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
             axes, below = signals[2 * i : 2 * i + 2]
             axes.set_title(f"fit {score.fit_percent[name]:.2f} %, rmse {_quantity(score.rmse[name], unit)}")
             _draw_series(axes, record.time, {"measured": measured, "model": simulated[name]}, name, unit)
-            _draw_residual(below, record.time, measured - simulated[name], unit)
+            _draw_residual(below, record.time, measured - simulated[name], unit, bands.get(name))
         _share_time(signals, record)
         _draw_search(search, fit)
         figure.align_ylabels()
@@ -99,6 +106,41 @@ def plot_identification(
         for axes, fit, true in zip(columns, fits, known or [{}] * len(fits), strict=True):
             _draw_identification(axes, fit, true)
         figure.align_ylabels()
+    return figure
+
+
+def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
+    """Draw the signed root of each profile's rise in cost against the parameter, with its interval.
+
+    The straight line is what the standard error alone says.
+    """
+    names = list(found.profiles)
+    columns = min(3, len(names))
+    quantile = quantile_of(found.level)
+    with _style():
+        figure = _figure(width=3.4 * columns, height=2.6 * -(-len(names) // columns) + 0.3)
+        every = figure.subplots(-(-len(names) // columns), columns, squeeze=False).ravel()
+        for axes, name in zip(every, names, strict=False):
+            profile, unit = found.profiles[name], found.units[name]
+            estimate, error = found.estimates[name], found.standard_errors[name]
+            prefix = _prefix(abs(estimate), unit)
+            factor = _PREFIXES[prefix]
+            if math.isfinite(error):
+                reach = 3.0 * error * np.array([-1.0, 1.0])
+                axes.plot((estimate + reach) / factor, [-3.0, 3.0], color=_MEASURED, ls=(0, (4, 3)))
+            axes.plot(profile.values / factor, profile.signed_root, color=_MODEL, marker=".", ms=4)
+            axes.axvspan(*(end / factor for end in profile.interval), color=_MODEL, alpha=0.12, lw=0)
+            axes.axhline(0.0, color=_AXIS, lw=0.8)
+            axes.set_yticks([-quantile, 0.0, quantile], [f"−{quantile:.2f}", "0", f"{quantile:.2f}"])
+            inside = [v for v, r in zip(profile.values, profile.signed_root, strict=True) if abs(r) < 2 * quantile]
+            low, high = min(*inside, profile.interval[0]), max(*inside, profile.interval[1])
+            axes.set(title=_words(name), xlabel=f"{prefix}{unit}" if unit else "", ylim=(-2 * quantile, 2 * quantile),
+                     xlim=(low / factor, high / factor))  # fmt: skip
+            axes.ticklabel_format(axis="x", useOffset=False)
+            axes.xaxis.get_major_locator().set_params(nbins=4)
+        for axes in every[len(names) :]:
+            axes.set_visible(False)
+        every[0].set_ylabel("signed root of\nthe rise in cost")
     return figure
 
 
@@ -190,8 +232,11 @@ def _draw_series(axes, time, series: Mapping[str, Any], name: str, unit: str) ->
     _legend(axes)
 
 
-def _draw_residual(axes, time, residual, unit: str) -> None:
+def _draw_residual(axes, time, residual, unit: str, band: "Band | None" = None) -> None:
     factor, label = _scaled(residual, unit)
+    if band is not None:
+        for half, alpha, words in ((band.measurement, 0.12, "95% of samples"), (band.model, 0.5, "95% of the model")):
+            axes.fill_between(time, -half / factor, half / factor, color=_MODEL, alpha=alpha, lw=0, label=words)
     axes.plot(time, residual / factor, color=_MEASURED, ls="none", marker=".", ms=2.0, rasterized=True,
               label="measured − model")  # fmt: skip
     axes.axhline(0, color=_AXIS, lw=0.8)

@@ -35,6 +35,7 @@ def save_fit(fit: Fit, path: str | os.PathLike) -> None:
         "warnings": fit.warnings,
         "huber": fit.huber,
         "estimated_initial": fit.estimated_initial,
+        "noise_variance_given": fit.noise_variance_given,
     }
     # An open file keeps the name as given: numpy would append .npz to a path.
     with open(path, "wb") as file:
@@ -80,6 +81,7 @@ def load_fit(path: str | os.PathLike, model: Model | None = None) -> Fit:
         warnings=tuple(facts["warnings"]),
         huber=facts["huber"],
         estimated_initial=tuple(facts["estimated_initial"]),
+        noise_variance_given=facts["noise_variance_given"],
     )
 
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from ehsvjax.fit import Effort, Fit
 from ehsvjax.models.model import Model, Parameter
+from ehsvjax.precision.directions import Direction
+from ehsvjax.precision.standard_errors import Precision
 from ehsvjax.record import Record
 
 
@@ -28,6 +30,17 @@ def summary_html(fit: Fit) -> str:
     return f'<div style="max-width: 60em">{"".join(_html_table(section) for section in _sections(fit))}</div>'
 
 
+def precision_summary(precision: Precision) -> str:
+    """Return parameters with standard errors, correlations and what is not fixed, as text."""
+    rows = [
+        (name, f"{value:.6g}", _error(precision, name), precision.units[name])
+        for name, value in precision.values.items()
+    ]
+    sections = [_Section("Parameters", rows, ("name", "value", "standard error", "unit"))]
+    sections += _precision_sections(precision)
+    return "\n".join(line for section in sections for line in _text_lines(section))
+
+
 class _Section(NamedTuple):
     """A titled table; `head` names its columns where that needs saying."""
 
@@ -37,7 +50,9 @@ class _Section(NamedTuple):
 
 
 _OUTPUT_HEAD = ("output", "rmse", "fit", "noise standard deviation")
-_PARAMETER_HEAD = ("name", "symbol", "value", "unit", "bounds")
+_PARAMETER_HEAD = ("name", "symbol", "value", "standard error", "unit", "bounds")
+# Correlations that are printed, as in lmfit's reports.
+_LEAST_CORRELATION = 0.5
 _RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
 
 
@@ -47,7 +62,9 @@ def _sections(fit: Fit) -> Iterator[_Section]:
     yield _Section(title, [_record_row(record) for record in fit.records], _RECORD_HEAD)
     yield _Section("Fit statistics", _statistics_rows(fit))
     yield _Section("Outputs", _output_rows(fit), _OUTPUT_HEAD)
-    yield _Section("Parameters", [_parameter_row(fit, p) for p in fit.model.parameters], _PARAMETER_HEAD)
+    precision = fit.precision()
+    yield _Section("Parameters", [_parameter_row(fit, precision, p) for p in fit.model.parameters], _PARAMETER_HEAD)
+    yield from _precision_sections(precision)
     if fit.model.initial:
         yield _initial_section(fit)
     yield _Section("Warnings", [(warning,) for warning in fit.warnings or ("none",)])
@@ -119,11 +136,49 @@ def _output_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     ]
 
 
-def _parameter_row(fit: Fit, parameter: Parameter) -> tuple[str, ...]:
-    identified = parameter.name in fit.parameters
-    value = fit.parameters[parameter.name] if identified else parameter.value
-    bounds = f"{parameter.lower:.6g} .. {parameter.upper:.6g}" if identified else "(fixed)"
-    return parameter.name, parameter.symbol, f"{value:.6g}", parameter.unit, bounds
+def _parameter_row(fit: Fit, precision: Precision, parameter: Parameter) -> tuple[str, ...]:
+    name, symbol, unit = parameter.name, parameter.symbol, parameter.unit
+    if name not in fit.parameters:
+        return name, symbol, f"{parameter.value:.6g}", "", unit, "(fixed)"
+    bounds = f"{parameter.lower:.6g} .. {parameter.upper:.6g}"
+    return name, symbol, f"{fit.parameters[name]:.6g}", _error(precision, name), unit, bounds
+
+
+def _error(precision: Precision, name: str) -> str:
+    error, value = precision.standard_errors[name], precision.values[name]
+    if not math.isfinite(error):
+        return "not fixed"
+    return f"+/- {error:.3g}" + (f" ({_percent(100.0 * error / abs(value))})" if value else "")
+
+
+def _percent(share: float) -> str:
+    return f"{share:.2f}%" if share >= 0.1 else f"{share:.2g}%"
+
+
+def _precision_sections(precision: Precision) -> Iterator[_Section]:
+    above = {pair: value for pair, value in precision.correlations.items() if abs(value) > _LEAST_CORRELATION}
+    pairs = sorted(above.items(), key=lambda item: -abs(item[1]))
+    if pairs:
+        rows = [(f"C({first}, {second})", f"= {value:+.3f}") for (first, second), value in pairs]
+        yield _Section(f"Correlations above {_LEAST_CORRELATION:g}", rows)
+    if precision.unfixed:
+        rows = [(_direction(direction), direction.remedy) for direction in precision.unfixed]
+        yield _Section("Not fixed by the record" + ("s" if len(precision.initial_errors) > 1 else ""), rows)
+    if precision.combinations:
+        fixed = [
+            (c.name, f"{c.value:.6g}", f"+/- {c.standard_error:.3g} ({_percent(c.percent)})")
+            for c in precision.combinations
+        ]
+        yield _Section("Fixed all the same", fixed)
+    yield _Section("Noise that the errors count on", [(precision.noise,)])
+
+
+def _direction(direction: Direction) -> str:
+    """Return who goes up with whom, with the standard deviation where the direction shows at all."""
+    up = [name for name, weight in direction.weights.items() if weight > 0]
+    down = [name for name, weight in direction.weights.items() if weight < 0]
+    words = f"{', '.join(up)} up" + (f", {', '.join(down)} down" if down else "") if len(up + down) > 1 else up[0]
+    return words if math.isinf(direction.deviation) else f"{words} (to {100 * direction.deviation:.2g}%)"
 
 
 def _initial_section(fit: Fit) -> _Section:

@@ -68,7 +68,8 @@ import json, sys
 import jax
 before = dict(jax.config.values)
 import ehsvjax
-heavy = [m for m in ("pandas", "matplotlib.pyplot", "scipy.io", "jinja2", "tqdm", "IPython") if m in sys.modules]
+heavy = ["pandas", "matplotlib.pyplot", "scipy.io", "scipy.signal", "scipy.stats", "jinja2", "tqdm", "IPython"]
+heavy = [m for m in heavy if m in sys.modules]
 from jax._src import xla_bridge
 print(json.dumps({"heavy": heavy, "changed": [k for k, v in jax.config.values.items() if before[k] != v],
                   "backends": bool(xla_bridge._backends)}))
@@ -97,7 +98,8 @@ NEVER = {
     "islands": ("population", "models", "record", "simulate", "hydraulics"),
     "search": ("population", "models", "record", "simulate"),
     "refine": ("genetic", "operators", "search", "identify"),
-    "precision": ("genetic", "operators", "search", "refine", "identify"),
+    "precision": ("genetic", "operators", "search", "identify", "fit"),
+    "precision.of_fit": ("genetic", "operators", "search", "identify"),
     "identify": ("plots", "report", "paper", "models.servovalve", "models.van_der_pol"),
     "fit": ("plots", "report", "paper", "population", "genetic"),
 }

@@ -101,10 +101,10 @@ def test_gradient_and_information_are_those_of_finite_differences():
         problem = cast(problem, jnp.float64)
         point = jnp.array([0.45, 0.6, 0.5, 0.48])
         measure = jax.jit(functools.partial(cost_gradient_information, problem))
-        cost, gradient, information, _ = measure(point)
+        (cost,), (gradient,), (information,), _ = measure(point[None])
         for i in range(4):
             step = 1e-6 * jnp.eye(4)[i]
-            above, below = measure(point + step)[0], measure(point - step)[0]
+            above, below = measure((point + step)[None])[0][0], measure((point - step)[None])[0][0]
             assert (above - below) / 2e-6 == pytest.approx(2.0 * float(gradient[i]), rel=1e-4, abs=1e-3)
     assert np.isfinite(cost)
     assert np.all(np.linalg.eigvalsh(information) > 0)

@@ -7,7 +7,7 @@ from ehsvjax.summary import summary, summary_html
 from tests import hand_made
 
 # rmse: three errors of 0.1. fit: 100*(1 - sqrt(0.03/18.96)), 18.96 = 2.6^2 + 0.8^2 + 3.4^2 about the mean 5.2.
-# cost: 0.03 N^2 times the period of 0.5 s.
+# cost: 0.03 N^2 times the period of 0.5 s. standard error: 0.03 N^2 over 3 - 1 degrees of freedom, over 1 + 4 + 16 V^2.
 SUMMARY = """\
 [[Model]]
     name     amplifier
@@ -26,9 +26,11 @@ SUMMARY = """\
     output  rmse         fit      noise standard deviation
     force   1.000e-01 N  96.02 %  1.000e-01 N
 [[Parameters]]
-    name         symbol  value  unit  bounds
-    gain         k       2      N/V   0.5 .. 5
-    temperature  T       293    K     (fixed)
+    name         symbol  value  standard error      unit  bounds
+    gain         k       2      +/- 0.0267 (1.34%)  N/V   0.5 .. 5
+    temperature  T       293                        K     (fixed)
+[[Noise that the errors count on]]
+    white, of the residuals' variance: the residuals are too few to tell
 [[Initial conditions]]
     name          symbol  value  unit
     initial_load  F(0)    0.5    N

@@ -1,0 +1,48 @@
+"""Bands about a simulated output: where the model's own curve may lie, and where a new measurement would."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.precision.sensitivities import Sensitivities
+
+
+class Band(NamedTuple):
+    """Half widths of the bands about one simulated output, in its unit.
+
+    Attributes:
+        model: `[time]`, for the errors of the parameters and initial conditions: where the true curve lies.
+        measurement: `[time]`, for the noise as well: where a new sample lies.
+
+    """
+
+    model: Float[np.ndarray, " time"]
+    measurement: Float[np.ndarray, " time"]
+
+
+def deviations(
+    found: Sensitivities, covariance: Float[np.ndarray, "parameter parameter"]
+) -> Float[np.ndarray, "record time signal"]:
+    """Return the standard deviation of each simulated output due to the unknowns', in noise standard deviations."""
+    return np.sqrt(np.maximum(np.einsum("...p,pq,...q->...", found.jacobian, covariance, found.jacobian), 0.0))
+
+
+def total_sensitivities(
+    found: Sensitivities,
+) -> tuple[Float[np.ndarray, "record time signal parameter"], Float[np.ndarray, "record time signal initial"]]:
+    """Return the sensitivities to the parameters of a record whose initial conditions are fitted for given parameters.
+
+    As the parameters move, the initial conditions move with them: J - J0 (J0^T J0)^-1 J0^T J. The second result are the
+    initial conditions' own, in units of their errors.
+    """
+    count = len(found.names)
+    initial = found.rows[:, count:]
+    size = np.linalg.norm(initial, axis=0)
+    kept = size > 0
+    basis, values, vectors = np.linalg.svd(initial[:, kept] / size[kept], full_matrices=False)
+    informed = values > 1e-8 * max(values[0], np.finfo(float).tiny) if len(values) else np.zeros(0, bool)
+    to_units = (vectors[informed].T / values[informed]) / size[kept][:, None]
+    own = found.jacobian[..., count:][..., kept] @ to_units
+    following = basis[:, informed].T @ found.rows[:, :count]
+    return found.jacobian[..., :count] - own @ following, own

@@ -1,0 +1,145 @@
+"""The bootstrap: refit records drawn anew from the fit, all draws in one batch, without any formula for the errors."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Key
+
+from ehsvjax.population import Problem, cast, to_unit, to_values
+from ehsvjax.precision.residual_noise import ResidualNoise
+from ehsvjax.precision.standard_errors import quantile_of
+from ehsvjax.refine import refine
+
+# Draws that are refitted side by side.
+_TOGETHER = 32
+
+
+class Bootstrap(NamedTuple):
+    """Parameters refitted to drawn records.
+
+    Attributes:
+        parameters: name -> `[draw]`, SI, of the refits that converged.
+        estimates: name -> value of the fit itself, SI.
+        lost: how many refits did not converge, and are left out.
+
+    """
+
+    parameters: dict[str, Float[np.ndarray, " draw"]]
+    estimates: dict[str, float]
+    lost: int
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Name -> standard deviation over the draws, SI."""
+        return {name: float(np.std(values, ddof=1)) for name, values in self.parameters.items()}
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Return name -> (lower, upper), the basic interval: the estimate less the draws' own deviations.
+
+        Davison & Hinkley 1997, Bootstrap Methods and their Application, section 5.2.
+
+        Raises:
+            ValueError: unless the level is between 0 and 1.
+
+        """
+        quantile_of(level)
+        tail = 0.5 * (1.0 - level)
+        found = {}
+        for name, values in self.parameters.items():
+            low, high = np.quantile(values, [tail, 1.0 - tail])
+            found[name] = (float(2.0 * self.estimates[name] - high), float(2.0 * self.estimates[name] - low))
+        return found
+
+
+def bootstrap(
+    problem: Problem,
+    values: Float[np.ndarray, " parameter"],
+    simulated: Float[np.ndarray, "record time signal"],
+    noises: list[ResidualNoise],
+    factor: float,
+    *,
+    key: Key[Array, ""],
+    draws: int,
+    kind: str,
+) -> Bootstrap:
+    """Refit drawn records, from the fit's own values on.
+
+    Args:
+        problem: in NumPy float64.
+        values: of every unknown of the fit, SI.
+        simulated: the fit's outputs, SI.
+        noises: of each output's standardised residuals.
+        factor: variance of the noise in units of the problem's.
+        key: random key.
+        draws: how many.
+        kind: "parametric" draws Gaussian noise of the residuals' own colour; "block" puts blocks of the residuals
+            themselves together anew (Kunsch 1989), longer than the noise is correlated.
+
+    Raises:
+        ValueError: for an unknown kind, or fewer than 2 draws.
+
+    """
+    if kind not in ("parametric", "block"):
+        raise ValueError(f"expected kind 'parametric' or 'block', got {kind!r}")
+    if isinstance(draws, bool) or not isinstance(draws, int) or draws < 2:
+        raise ValueError(f"expected draws to be a whole number of at least 2, got {draws!r}")
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
+    deviation = np.sqrt(problem.noise_variance * factor)
+    shape = simulated.shape[:2]
+    drawn = np.empty((draws, *simulated.shape))
+    for i, noise in enumerate(noises):
+        if kind == "parametric":
+            relative = _coloured(random, noise, (draws, *shape))
+        else:
+            residuals = (problem.samples.outputs - simulated)[..., i] / np.sqrt(problem.noise_variance[i] * factor)
+            relative = _blocks(random, residuals, problem.samples.measured[..., i], noise, draws)
+        drawn[..., i] = simulated[..., i] + deviation[i] * relative
+    start = np.clip(to_unit(problem.coordinates, values), 0.0, 1.0)
+    with jax.enable_x64(True):
+        individuals, converged = _refits(cast(problem, jnp.float64), jnp.asarray(drawn), jnp.asarray(start))
+    refitted, good = to_values(problem.coordinates, np.asarray(individuals)), np.asarray(converged)
+    return Bootstrap(
+        {name: refitted[good, i] for i, name in enumerate(problem.free)},
+        {name: float(values[i]) for i, name in enumerate(problem.free)},
+        int(np.sum(~good)),
+    )
+
+
+@jax.jit
+def _refits(problem: Problem, outputs: Float[Array, "draw record time signal"], start: Float[Array, " parameter"]):
+    def refit(outputs):
+        found = refine(replace(problem, samples=problem.samples._replace(outputs=outputs)), start[None])
+        return found.individual[0], found.converged[0]
+
+    return lax.map(refit, outputs, batch_size=min(_TOGETHER, len(outputs)))
+
+
+def _coloured(random: np.random.Generator, noise: ResidualNoise, shape: tuple[int, ...]) -> np.ndarray:
+    """Return noise of unit variance with the residuals' colour, `[draw, record, time]`, from its steady state on."""
+    if not len(noise.coefficients):
+        return random.standard_normal(shape)
+    from scipy.signal import lfilter  # slow to import
+
+    settling = 20 * len(noise.coefficients) + int(20 * noise.correlation_samples)
+    innovations = random.standard_normal((*shape[:-1], shape[-1] + settling))
+    coloured = lfilter([1.0], np.concatenate([[1.0], -noise.coefficients]), innovations, axis=-1)
+    return coloured[..., settling:] * np.sqrt(noise.innovation_variance / noise.variance)
+
+
+def _blocks(random: np.random.Generator, residuals, measured, noise: ResidualNoise, draws: int) -> np.ndarray:
+    """Return residuals put together from blocks that begin anywhere and go round at the end of the record."""
+    records, length = residuals.shape
+    block = int(np.clip(10 * noise.correlation_samples, 1, max(length // 10, 1))) if len(noise.coefficients) else 1
+    drawn = np.zeros((draws, records, length))
+    for record in range(records):
+        source = residuals[record][measured[record]]
+        # Residuals are smaller than the noise by what the unknowns took; their mean is the model's error.
+        source = (source - source.mean()) / max(source.std(), np.finfo(float).tiny)
+        starts = random.integers(0, len(source), (draws, -(-length // block)))
+        places = (starts[:, :, None] + np.arange(block)) % len(source)
+        drawn[:, record] = source[places.reshape(draws, -1)[:, :length]]
+    return drawn

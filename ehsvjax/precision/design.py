@@ -1,0 +1,101 @@
+"""Before any data: what errors an experiment leads to, from the model and the excitation alone."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ehsvjax.models.model import Model
+from ehsvjax.population import Problem
+from ehsvjax.precision.sensitivities import sensitivities
+from ehsvjax.precision.standard_errors import Precision, covariance_of, linearised, precision_of
+from ehsvjax.record import Record
+from ehsvjax.simulate import simulate
+from ehsvjax.unknowns import Initial, problem_of
+
+
+def design(
+    model: Model,
+    records: Record | Sequence[Record],
+    *,
+    noise_variance: Mapping[str, float],
+    parameters: Mapping[str, float] | None = None,
+    initial_values: Mapping[str, float] | None = None,
+    initial: Initial = "estimate",
+) -> Precision:
+    """Return the precision that an experiment would give, before it is done: amplitude, hold time and length to choose.
+
+    The standard errors are the Cramer-Rao bound under white Gaussian noise, to which an identification by `identify`
+    comes; parameters that the experiment would not fix are named, with what would.
+
+    Args:
+        model: whose free parameters are to be identified.
+        records: the planned experiment, one or several: times and inputs. Outputs are not looked at.
+        noise_variance: name of each output that would be measured -> variance of its noise, unit squared.
+        parameters: name -> value to expect; by default nominal.
+        initial_values: name -> initial condition to expect; by default nominal.
+        initial: which initial conditions would be estimated too, as for `identify`.
+
+    Raises:
+        ValueError: as `identify` does, and for an output that the model does not have.
+
+    """
+    for name in noise_variance:
+        if name not in model.outputs:
+            known = ", ".join(model.outputs)
+            raise ValueError(f"expected noise_variance of outputs of {model.name}, {known}; got {name!r}")
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    expected = []
+    for record in records:
+        simulated = simulate(model, record, parameters, initial_values)
+        expected.append(replace(record, outputs={name: simulated[name] for name in noise_variance}))
+    problem = problem_of(model, expected, initial=initial, noise_variance=noise_variance)
+    point = _point(model, problem, parameters, initial_values)
+    return precision_of(model, problem, linearised(problem, point, noise_variance_given=True, expected=True))
+
+
+def cramer_rao_bound(
+    model: Model,
+    records: Record | Sequence[Record],
+    *,
+    noise_variance: Mapping[str, float],
+    parameters: Mapping[str, float] | None = None,
+    initial_values: Mapping[str, float] | None = None,
+    initial: Initial = "estimate",
+) -> dict[str, float]:
+    """Return the smallest standard deviation that an unbiased estimate can have under white Gaussian noise.
+
+    From the Fisher information J^T J / noise_variance, J the sensitivities of the outputs to the free parameters and to
+    the initial conditions that are estimated with them, by forward differentiation in float64 (Ljung 1999, System
+    Identification, section 7.4).
+
+    Args:
+        model: whose free parameters are meant.
+        records: their times, inputs, and which samples of which outputs are measured; the values measured do not count.
+        noise_variance: name of the output -> variance, unit squared.
+        parameters: name -> value at which the bound is taken; by default nominal.
+        initial_values: name -> initial condition at which it is taken; by default nominal.
+        initial: which initial conditions are estimated too, as for `identify`.
+
+    Returns:
+        name -> standard deviation, SI, of each free parameter; +inf for those of which the records show nothing.
+
+    Raises:
+        ValueError: as `identify` does.
+
+    """
+    records = (records,) if isinstance(records, Record) else tuple(records)
+    problem = problem_of(model, records, initial=initial, noise_variance=noise_variance)
+    found = sensitivities(problem, _point(model, problem, parameters, initial_values))
+    covariance, seen = covariance_of(found, None, 1.0)
+    deviations = np.where(seen, np.sqrt(np.diagonal(covariance)) * found.scale, np.inf)
+    return {name: float(deviation) for name, deviation in zip(problem.free, deviations, strict=False)}
+
+
+def _point(model: Model, problem: Problem, parameters, initial_values) -> np.ndarray:
+    values = model.nominal | dict(parameters or {})
+    start = {p.name: p.value for p in model.initial} | dict(initial_values or {})
+    count = len(problem.samples.inputs)
+    return np.array(
+        [values[name] for name in problem.free] + [start[name] for _ in range(count) for name in problem.free_initial]
+    )

@@ -1,0 +1,182 @@
+"""Which directions of the parameters a record fixes, and which it does not: named, with what would.
+
+A direction is a joint change of several parameters. Where the record does not show it, none of its parameters has a
+standard error; products and ratios that it leaves alone may be fixed all the same.
+"""
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.precision.sensitivities import Sensitivities
+
+NOT_FIXED = 1.0
+"""Standard deviation from which on a direction is not fixed: 100% of the value, or the width of the bounds."""
+
+# Singular values below this share of the largest are rounding in float64.
+_ROUNDING = 1e-8
+# Components of a unit vector below this do not count as taking part.
+_TAKES_PART = 1e-4
+
+
+class Direction(NamedTuple):
+    """A joint change of parameters that the record does not fix.
+
+    Attributes:
+        weights: name -> component of the unit vector, largest first: relative changes, or shares of the bounds' width.
+        deviation: standard deviation along it; +inf where nothing of it shows.
+        structural: no record of this kind shows it, whatever its amplitude.
+        remedy: what would fix it.
+
+    """
+
+    weights: dict[str, float]
+    deviation: float
+    structural: bool = False
+    remedy: str = ""
+
+
+class Combination(NamedTuple):
+    """A product of powers (or a sum) of parameters that is fixed although they are not.
+
+    Attributes:
+        name: "flow_gain x feedback_gain".
+        exponents: name -> power; of a sum, name -> factor.
+        value: of the combination, SI.
+        standard_error: likewise.
+
+    """
+
+    name: str
+    exponents: dict[str, float]
+    value: float
+    standard_error: float
+
+    @property
+    def percent(self) -> float:
+        """Standard error in per cent of the value."""
+        return 100.0 * self.standard_error / abs(self.value)
+
+
+class Spectrum(NamedTuple):
+    """Singular directions of the parameters' sensitivities, what initial conditions could imitate taken out.
+
+    Attributes:
+        directions: `[parameter, direction]`, unit vectors in the parameters' own units.
+        deviation: `[direction]` standard deviation along each, +inf where it is rounding.
+
+    """
+
+    directions: Float[np.ndarray, "parameter direction"]
+    deviation: Float[np.ndarray, " direction"]
+
+    @property
+    def unfixed(self) -> Float[np.ndarray, "parameter direction"]:
+        """The directions that are not fixed."""
+        return self.directions[:, self.deviation > NOT_FIXED]
+
+    def along(self, vector: Float[np.ndarray, " parameter"]) -> float:
+        """Return the standard deviation along a unit vector."""
+        parts = self.directions.T @ vector
+        if np.any(np.abs(parts[~np.isfinite(self.deviation)]) > _TAKES_PART):
+            return float("inf")
+        return float(np.linalg.norm(parts[np.isfinite(self.deviation)] * self.deviation[np.isfinite(self.deviation)]))
+
+
+def spectrum(root: Float[np.ndarray, "parameter parameter"]) -> Spectrum:
+    """Return the singular directions of the free parameters from a root of their information."""
+    values, vectors = np.linalg.svd(root)[1:]
+    seen = values > _ROUNDING * max(values[0], np.finfo(float).tiny)
+    return Spectrum(vectors.T, np.where(seen, 1.0 / np.where(seen, values, 1.0), np.inf))
+
+
+def parameter_root(found: Sensitivities) -> Float[np.ndarray, "parameter parameter"]:
+    """Return R with R^T R the information of the free parameters, that of the initial conditions eliminated."""
+    rows, count = found.rows, len(found.names)
+    nuisance, parameters = rows[:, count:], rows[:, :count]
+    size = np.linalg.norm(nuisance, axis=0)
+    basis, triangle = np.linalg.qr(nuisance[:, size > 0] / size[size > 0])
+    # Initial conditions that cannot be told apart span fewer dimensions than there are of them.
+    basis = basis[:, np.abs(np.diagonal(triangle)) > _ROUNDING]
+    return np.asarray(np.linalg.qr(parameters - basis @ (basis.T @ parameters), mode="r"))
+
+
+def named(names: Sequence[str], vector: Float[np.ndarray, " parameter"]) -> dict[str, float]:
+    """Return the components that count, largest first, the sign such that the largest is positive."""
+    order = np.argsort(-np.abs(vector), kind="stable")
+    # Of equally large ones the first that is named leads.
+    leading = next(i for i in range(len(vector)) if abs(vector[i]) > (1.0 - 1e-6) * abs(vector[order[0]]))
+    sign = np.sign(vector[leading])
+    return {names[i]: float(sign * vector[i]) for i in order if abs(vector[i]) > _TAKES_PART * 10}
+
+
+def taking_part(unfixed: Float[np.ndarray, "parameter direction"]) -> np.ndarray:
+    """Return which parameters take part in directions that are not fixed, `[parameter]`."""
+    return np.linalg.norm(unfixed, axis=1) > _TAKES_PART
+
+
+def combinations(found: Sensitivities, fixed: Spectrum) -> tuple[Combination, ...]:
+    """Return what is fixed of each parameter that is not, but for as many as there are directions.
+
+    The parameters left over are those by which the others are multiplied or divided, chosen so that the largest error
+    of a combination is least. Relative changes combine as products of powers, others as sums.
+    """
+    unfixed = fixed.unfixed
+    tied = np.flatnonzero(taking_part(unfixed))
+    count = unfixed.shape[1]
+    if count == 0 or len(tied) <= count:
+        return ()
+    informed = fixed.deviation <= NOT_FIXED
+    root = fixed.directions[:, informed] * fixed.deviation[informed]
+    candidates = []
+    for pivots in _choices(tied, count):
+        others = [i for i in tied if i not in pivots]
+        weights = -np.linalg.lstsq(unfixed[pivots].T, unfixed[others].T, rcond=None)[0].T
+        vectors = np.zeros((len(others), len(unfixed)))
+        vectors[np.arange(len(others)), others] = 1.0
+        vectors[:, pivots] = weights
+        errors = np.linalg.norm(vectors @ root, axis=1)
+        candidates.append((np.max(np.abs(weights)) > 10.0, float(np.max(errors)), vectors, errors))
+    _, _, vectors, errors = min(candidates, key=lambda c: c[:2])
+    return tuple(_combination(found, vector, error) for vector, error in zip(vectors, errors, strict=True))
+
+
+def _choices(tied: np.ndarray, count: int) -> list[list[int]]:
+    """Return the sets of pivots to try: each parameter alone for one direction, otherwise the first that are apart."""
+    return [[int(i)] for i in tied] if count == 1 else [[int(i) for i in tied[:count]]]
+
+
+def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Combination:
+    taking = [i for i in np.argsort(-np.abs(vector), kind="stable") if abs(vector[i]) > _TAKES_PART]
+    names = found.names
+    if all(found.relative[i] for i in taking):
+        powers = {names[i]: _rounded(vector[i]) for i in taking}
+        value = float(np.prod([found.values[i] ** vector[i] for i in taking]))
+        return Combination(_product(powers), powers, value, abs(value) * error)
+    # A sum, in the unit of the first.
+    first = taking[0]
+    factors = {names[i]: float(vector[i] * found.scale[first] / found.scale[i] / vector[first]) for i in taking}
+    value = float(sum(factor * found.values[names.index(name)] for name, factor in factors.items()))
+    return Combination(_sum(factors), factors, value, float(found.scale[first] * error / abs(vector[first])))
+
+
+def _rounded(power: float) -> float:
+    near = Fraction(power).limit_denominator(4)
+    return float(near) if abs(float(near) - power) < 1e-3 else float(power)
+
+
+def _product(powers: dict[str, float]) -> str:
+    def term(name, power):
+        return name if power == 1 else f"{name}^{power:.3g}"
+
+    above = [term(name, power) for name, power in powers.items() if power > 0]
+    below = [term(name, -power) for name, power in powers.items() if power < 0]
+    return " x ".join(above) + "".join(f" / {name}" for name in below)
+
+
+def _sum(factors: dict[str, float]) -> str:
+    terms = [f"{'+' if factor > 0 else '-'} {abs(factor):.3g} {name}" for name, factor in factors.items()]
+    return " ".join(terms).removeprefix("+ ").removeprefix("1 ")

@@ -1,0 +1,126 @@
+"""What a fit says about its precision: the pieces of this folder put to a `Fit`."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from ehsvjax.fit import Fit
+from ehsvjax.population import Problem
+from ehsvjax.precision.bands import Band, deviations, total_sensitivities
+from ehsvjax.precision.bootstrap import Bootstrap, bootstrap
+from ehsvjax.precision.profile import ProfileLikelihood, profile_likelihood
+from ehsvjax.precision.sensitivities import sensitivities
+from ehsvjax.precision.standard_errors import (
+    Linearised,
+    Precision,
+    covariance_of,
+    linearised,
+    precision_of,
+    quantile_of,
+)
+from ehsvjax.record import Record
+from ehsvjax.unknowns import problem_of
+
+
+class Prepared(NamedTuple):
+    """A fit as its problem, the values of the unknowns, and to first order."""
+
+    problem: Problem
+    values: Float[np.ndarray, " parameter"]
+    first_order: Linearised
+
+
+def prepared(fit: Fit, colour: str) -> Prepared:
+    """Return what everything here starts from."""
+    problem = _problem(fit, fit.records, fit.initial)
+    values = [fit.parameters[name] for name in problem.free]
+    values += [initial[name] for initial in fit.initial for name in problem.free_initial]
+    point = np.array(values)
+    given = fit.noise_variance_given
+    return Prepared(problem, point, linearised(problem, point, noise_variance_given=given, colour=colour))
+
+
+def precision(fit: Fit, of: Prepared) -> Precision:
+    """Return standard errors, correlations and identifiable directions."""
+    return precision_of(fit.model, of.problem, of.first_order)
+
+
+def profiles(fit: Fit, of: Prepared, names: Sequence[str] | None, level: float) -> ProfileLikelihood:
+    """Return profile likelihood intervals.
+
+    Raises:
+        ValueError: for a name that is not identified, or a level that is none.
+
+    """
+    names = of.problem.free if names is None else tuple(names)
+    for name in names:
+        if name not in of.problem.free:
+            raise ValueError(f"expected parameters that were identified, {', '.join(of.problem.free)}; got {name!r}")
+    found, _, factor, _, covariance, seen = of.first_order
+    deviation = np.sqrt(np.diagonal(covariance_of(found, None, factor)[0]))
+    # Where the noise is coloured the cost rises too fast by the ratio of the variances (Rotnitzky & Jewell 1990).
+    ratio = np.diagonal(covariance) / np.where(deviation > 0, deviation**2, 1.0)
+    factors = {name: float(factor * (ratio[i] if seen[i] else 1.0)) for i, name in enumerate(of.problem.free)}
+    scale = found.scale
+    return profile_likelihood(
+        of.problem,
+        of.values,
+        covariance * np.outer(scale, scale),
+        seen,
+        names=names,
+        level=level,
+        noise_factors=factors,
+        units={name: fit.model.parameter(name).unit for name in names},
+        together=fit.effort.starts or 5,
+    )
+
+
+def draws(fit: Fit, of: Prepared, key: Key[Array, ""], count: int, kind: str) -> Bootstrap:
+    """Return the bootstrap."""
+    del fit
+    found, noises, factor, *_ = of.first_order
+    assert noises is not None
+    return bootstrap(of.problem, of.values, found.simulated, noises, factor, key=key, draws=count, kind=kind)
+
+
+def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict[str, Band]:
+    """Return the bands about the outputs of one record, by name of the output.
+
+    Raises:
+        ValueError: if the record holds none of the outputs that were fitted.
+
+    """
+    quantile = quantile_of(level)
+    found, _, factor, _, covariance, _ = of.first_order
+    noise = np.sqrt(of.problem.noise_variance)
+    for i, fitted in enumerate(fit.records):
+        if fitted is record:
+            spread = deviations(found, covariance)[i, : len(record)]
+            return _bands(of.problem.observed, spread, noise, factor, quantile)
+    names = [name for name in record.outputs if name in fit.noise_variance]
+    if not names:
+        raise ValueError(f"expected {record.name} to hold one of {', '.join(fit.noise_variance)}, got none of them")
+    start = fit.initial_of(record, initial)
+    problem = _problem(fit, [record.select(outputs=names)], [start])
+    values = [fit.parameters[name] for name in problem.free] + [start[name] for name in problem.free_initial]
+    new = sensitivities(problem, np.array(values))
+    count = len(new.names)
+    by_parameters, by_initial = total_sensitivities(new)
+    variance = np.einsum("...p,pq,...q->...", by_parameters, covariance[:count, :count], by_parameters)
+    spread = np.sqrt(np.maximum(variance + factor * np.sum(by_initial**2, axis=-1), 0.0))[0]
+    return _bands(problem.observed, spread, np.sqrt(problem.noise_variance), factor, quantile)
+
+
+def _bands(names, spread, noise, factor, quantile) -> dict[str, Band]:
+    return {
+        name: Band(quantile * noise[i] * spread[:, i], quantile * noise[i] * np.sqrt(spread[:, i] ** 2 + factor))
+        for i, name in enumerate(names)
+    }
+
+
+def _problem(fit: Fit, records, initial) -> Problem:
+    known = [{name: v for name, v in values.items() if name not in fit.estimated_initial} for values in initial]
+    variance = {name: v for name, v in fit.noise_variance.items() if any(name in r.outputs for r in records)}
+    return problem_of(fit.model, records, initial=known, noise_variance=variance, huber=fit.huber)

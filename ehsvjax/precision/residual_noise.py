@@ -1,0 +1,123 @@
+"""What noise the residuals are: white or coloured, and what that does to the errors of the parameters.
+
+White residuals have independent errors; correlated ones tell the same thing several times, so that the errors of slow
+parameters are larger than the Fisher information says. The estimate stays what it is (least squares), its covariance
+becomes the sandwich B S B with S = J^T Sigma J (Huber 1967; White 1980). As J does not depend on the noise, Sigma is
+all that has to be estimated: by an autoregression, whose order the Bayes criterion chooses.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+_LAGS = 20
+SUSPICION = 0.01
+"""p-value below which residuals are taken to be correlated."""
+# Samples below which no test of colour means anything.
+_FEW = 50
+
+
+class ResidualNoise(NamedTuple):
+    """The noise that the residuals of one output look like.
+
+    Attributes:
+        p_value: of the Ljung-Box test of white noise, 20 lags; NaN where the samples are too few for it.
+        coefficients: a of the autoregression r[t] = a[0] r[t-1] + ... + e[t]; empty for white noise.
+        variance: of the standardised residuals.
+        innovation_variance: of e; the variance itself for white noise.
+
+    """
+
+    p_value: float
+    coefficients: Float[np.ndarray, " order"]
+    variance: float
+    innovation_variance: float
+
+    @property
+    def correlation_samples(self) -> float:
+        """Samples that tell as much as one independent sample would about a constant."""
+        return self.innovation_variance / (self.variance * (1.0 - np.sum(self.coefficients)) ** 2)
+
+    def spectrum(self, count: int) -> Float[np.ndarray, " frequency"]:
+        """Return the power at `count` frequencies of the unit circle, the variance at each for white noise."""
+        filter_ = np.concatenate([[1.0], -self.coefficients])
+        return self.innovation_variance / np.abs(np.fft.fft(filter_, count)) ** 2
+
+
+def residual_noise(
+    residuals: Float[np.ndarray, "record time"],
+    measured: Bool[np.ndarray, "record time"],
+    colour: str,
+) -> ResidualNoise:
+    """Return the noise of one output's standardised residuals; zero where nothing is measured."""
+    covariance = _autocovariance(residuals, measured, _order_tried(int(measured.sum())))
+    count = int(measured.sum())
+    p_value = _ljung_box(covariance, count)
+    white = ResidualNoise(p_value, np.zeros(0), float(covariance[0]), float(covariance[0]))
+    if colour == "white" or covariance[0] == 0 or (colour == "auto" and not p_value < SUSPICION):
+        return white
+    coefficients, innovation_variance = _autoregression(covariance, count)
+    return white._replace(coefficients=coefficients, innovation_variance=innovation_variance)
+
+
+def meat(
+    jacobian: Float[np.ndarray, "record time parameter"], noise: ResidualNoise
+) -> Float[np.ndarray, "parameter parameter"]:
+    """Return J^T Sigma J over the records, for one output; rows of J without a sample are zero."""
+    record_count, length, parameters = jacobian.shape
+    if not len(noise.coefficients):
+        flat = jacobian.reshape(-1, parameters)
+        return noise.variance * flat.T @ flat
+    # A Toeplitz matrix is a convolution: twice the length, so that it does not wrap round.
+    size = 2 * length
+    transformed = np.fft.fft(jacobian, size, axis=1).reshape(-1, parameters)
+    spectrum = np.tile(noise.spectrum(size), record_count)
+    return np.real(transformed.conj().T @ (spectrum[:, None] * transformed)) / size
+
+
+def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
+    """Return the p-value of white noise (Ljung & Box 1978); NaN for few samples, or none that differ."""
+    from scipy.special import chdtrc
+
+    lags = min(_LAGS, len(covariance) - 1)
+    if count < _FEW or lags < 1 or covariance[0] == 0:
+        return float("nan")
+    correlation = covariance[1 : lags + 1] / covariance[0]
+    statistic = count * (count + 2) * np.sum(correlation**2 / (count - np.arange(1, lags + 1)))
+    return float(chdtrc(lags, statistic))
+
+
+def _order_tried(count: int) -> int:
+    """Return the lags worth estimating: 10 log10(n), as usual, but at most an eighth of the samples."""
+    return int(max(1, min(_LAGS * 2, 10 * np.log10(max(count, 2)), count // 8)))
+
+
+def _autocovariance(residuals, measured, lags: int) -> Float[np.ndarray, " lag"]:
+    """Return the autocovariance of what is measured, lags 0 to `lags`, each over the pairs that there are."""
+    values = np.where(measured, residuals, 0.0)
+    length = values.shape[1]
+    covariance = []
+    for lag in range(min(lags, length - 1) + 1):
+        pairs = np.sum(measured[:, : length - lag] & measured[:, lag:])
+        # Over all samples, not over the pairs: the sequence then stays positive definite where nothing is missing.
+        share = pairs / max(np.sum(measured), 1) if measured.all() else 1.0
+        product = np.sum(values[:, : length - lag] * values[:, lag:])
+        covariance.append(product / max(pairs, 1) * share)
+    return np.array(covariance)
+
+
+def _autoregression(covariance: Float[np.ndarray, " lag"], count: int):
+    """Return the coefficients and innovation variance of the order that the Bayes criterion chooses (Levinson)."""
+    coefficients, variance = np.zeros(0), covariance[0]
+    best = (count * np.log(variance), coefficients, variance)
+    for order in range(1, len(covariance)):
+        reflection = (covariance[order] - coefficients @ covariance[order - 1 : 0 : -1]) / variance
+        if not abs(reflection) < 1.0:
+            break  # missing samples can make the sequence no autocovariance
+        coefficients = np.concatenate([coefficients - reflection * coefficients[::-1], [reflection]])
+        variance = variance * (1.0 - reflection**2)
+        criterion = count * np.log(variance) + order * np.log(count)
+        if criterion < best[0]:
+            best = (criterion, coefficients, variance)
+    return best[1], float(best[2])

@@ -1,0 +1,244 @@
+"""Standard errors and correlations of parameters, and which of them a record fixes at all."""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ehsvjax.models.model import Model
+from ehsvjax.population import Problem
+from ehsvjax.precision.directions import (
+    NOT_FIXED,
+    Combination,
+    Direction,
+    Spectrum,
+    combinations,
+    parameter_root,
+    spectrum,
+    taking_part,
+)
+from ehsvjax.precision.remedies import unfixed_directions
+from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, meat, residual_noise
+from ehsvjax.precision.sensitivities import Sensitivities, sensitivities
+
+_ROUNDING = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Precision:
+    """How sure the parameters are, to first order (Fisher information). Printed in lmfit's manner.
+
+    Attributes:
+        values: name -> value of each free parameter, SI.
+        units: name -> its unit.
+        standard_errors: name -> standard deviation, SI; +inf for a parameter that the record does not fix.
+        correlations: (name, name) -> correlation of each pair of parameters that are fixed.
+        covariance: `[parameter, parameter]`, SI, in the order of `values`; NaN where a parameter is not fixed.
+        combinations: products, ratios and sums that are fixed although their parameters are not.
+        unfixed: the directions that are not fixed, with what would fix them.
+        initial_errors: for each record, name -> standard deviation of the initial conditions estimated, SI.
+        noise: what noise was counted on, and why, in a sentence.
+        coloured: whether correlated noise was counted on.
+
+    """
+
+    values: dict[str, float]
+    units: dict[str, str]
+    standard_errors: dict[str, float]
+    correlations: dict[tuple[str, str], float]
+    covariance: Float[np.ndarray, "parameter parameter"]
+    combinations: tuple[Combination, ...]
+    unfixed: tuple[Direction, ...]
+    initial_errors: tuple[dict[str, float], ...]
+    noise: str
+    coloured: bool
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Return name -> (lower, upper) of each parameter by its standard error; infinite where it is not fixed.
+
+        Raises:
+            ValueError: unless the level is between 0 and 1.
+
+        """
+        quantile = quantile_of(level)
+        return {n: (v - quantile * self.standard_errors[n], v + quantile * self.standard_errors[n])
+                for n, v in self.values.items()}  # fmt: skip
+
+    def __str__(self) -> str:
+        """Return the table of parameters, correlations above 0.5, and what is not fixed."""
+        from ehsvjax.summary import precision_summary
+
+        return precision_summary(self)
+
+    __repr__ = __str__
+
+
+def quantile_of(level: float) -> float:
+    """Return the normal quantile of a two-sided interval.
+
+    Raises:
+        ValueError: unless the level is between 0 and 1.
+
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"expected a confidence level between 0 and 1, such as 0.95, got {level!r}")
+    return NormalDist().inv_cdf(0.5 + 0.5 * level)
+
+
+class Linearised(NamedTuple):
+    """A fit to first order: what standard errors, bands and draws are made of.
+
+    Attributes:
+        found: the sensitivities.
+        noises: of each output's residuals; None where the noise is expected, not seen.
+        factor: the noise's variance in units of the problem's.
+        words: what noise was counted on, and why.
+        covariance: `[parameter, parameter]` of the unknowns, each in its unit.
+        seen: `[parameter]` which of them the record shows apart at all.
+
+    """
+
+    found: Sensitivities
+    noises: list[ResidualNoise] | None
+    factor: float
+    words: str
+    covariance: Float[np.ndarray, "parameter parameter"]
+    seen: Bool[np.ndarray, " parameter"]
+
+
+def linearised(
+    problem: Problem,
+    values: Float[np.ndarray, " parameter"],
+    *,
+    noise_variance_given: bool,
+    colour: str = "auto",
+    expected: bool = False,
+) -> Linearised:
+    """Return the unknowns' covariance at their values.
+
+    Args:
+        problem: in NumPy float64.
+        values: of every unknown, SI.
+        noise_variance_given: whether the problem's noise variance is known, or is to be taken from the residuals.
+        colour: "white" noise, "coloured" noise, or "auto": coloured if the residuals are not white.
+        expected: there are no residuals: the noise is white, of the problem's variance.
+
+    Raises:
+        ValueError: for an unknown colour.
+
+    """
+    if colour not in ("auto", "white", "coloured"):
+        raise ValueError(f"expected noise to be 'auto', 'white' or 'coloured', got {colour!r}")
+    found = sensitivities(problem, values)
+    noises, factor, words = None, 1.0, "white, of the variance given"
+    if not expected:
+        noises, words, factor = _noise(problem, found, noise_variance_given, colour)
+    covariance, seen = covariance_of(found, noises, factor)
+    return Linearised(found, noises, factor, words, covariance, seen)
+
+
+def covariance_of(
+    found: Sensitivities, noises: list[ResidualNoise] | None, factor: float
+) -> tuple[Float[np.ndarray, "parameter parameter"], Bool[np.ndarray, " parameter"]]:
+    """Return the covariance of the unknowns, each in its unit, and which of them the record shows apart at all.
+
+    (J^T J)^-1 times the noise's variance; where the noise is coloured the sandwich with J^T Sigma J inside.
+    """
+    rows = found.rows
+    size = np.linalg.norm(rows, axis=0)
+    per_size = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
+    values, vectors = np.linalg.svd(np.linalg.qr(rows * per_size, mode="r"))[1:]
+    informed = values > _ROUNDING * max(values[0], np.finfo(float).tiny)
+    seen = (size > 0) & (np.linalg.norm(vectors[~informed], axis=0) < 1e-4)
+    half = (vectors[informed].T / values[informed]) * per_size[:, None]
+    bread = half @ half.T
+    if noises is None or not any(len(noise.coefficients) for noise in noises):
+        return factor * bread, seen
+    jacobian = np.where(found.measured[..., None], found.jacobian, 0.0)
+    inside = sum(factor * meat(jacobian[:, :, i], noise) / noise.variance for i, noise in enumerate(noises))
+    return bread @ inside @ bread, seen
+
+
+def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
+    """Return each output's noise, a sentence about it, and the variance in units of the problem's."""
+    standardised = (problem.samples.outputs - found.simulated) / np.sqrt(problem.noise_variance)
+    standardised = np.where(found.measured, standardised, 0.0)
+    count, unknowns = int(found.measured.sum()), len(found.values)
+    # The influence of a residual, and how much of a step of the parameters it undoes (Huber 1981, section 7.6).
+    influence, weight = standardised, 1.0
+    if problem.huber is not None:
+        influence = np.clip(standardised, -problem.huber, problem.huber)
+        weight = float(np.mean(np.abs(standardised[found.measured]) <= problem.huber))
+    noises = [
+        residual_noise(influence[..., i], found.measured[..., i], colour) for i in range(len(problem.noise_variance))
+    ]
+    mean_square = float(np.sum(influence**2)) / (count - unknowns)
+    if given and problem.huber is None:
+        factor, source = 1.0, "of the variance given"
+    else:
+        factor, source = mean_square / weight**2, "of the residuals' variance"
+    # Only the shape of a coloured noise comes from here; its size is the factor's.
+    return noises, _sentence(problem, noises, colour, source), factor
+
+
+def _sentence(problem: Problem, noises: list[ResidualNoise], colour: str, source: str) -> str:
+    p_value = min((noise.p_value for noise in noises), key=lambda p: (np.isnan(p), p))
+    test = f"Ljung-Box test p = {p_value:.2g}" if p_value >= 1e-3 else "Ljung-Box test p < 0.001"
+    coloured = [(name, n) for name, n in zip(problem.observed, noises, strict=True) if len(n.coefficients)]
+    if not coloured:
+        if colour == "white":
+            why = "asked for"
+        elif np.isnan(p_value):
+            why = "the residuals are too few to tell"
+        elif p_value < SUSPICION or colour == "coloured":
+            why = f"no autoregression describes the residuals better ({test})"
+        else:
+            why = f"the residuals look white ({test})"
+        return f"white, {source}: {why}"
+    period = float(np.max(problem.samples.sample_period))
+    each = ", ".join(
+        f"{name}: autoregression of order {len(n.coefficients)}, {n.correlation_samples:.3g} samples "
+        f"({1e3 * period * n.correlation_samples:.3g} ms) tell as much as one"
+        for name, n in coloured
+    )
+    why = "asked for" if colour == "coloured" else f"the residuals are correlated ({test})"
+    return f"coloured, {source}: {why}; {each}"
+
+
+def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
+    """Return what a person wants to know of a fit to first order."""
+    found, noises, factor, words, covariance, seen = fit
+    directions = spectrum(parameter_root(found) / np.sqrt(factor))
+    count, names = len(found.names), list(found.names)
+    deviation = np.sqrt(np.diagonal(covariance))
+    fixed = seen & (deviation <= NOT_FIXED)
+    fixed[:count] &= ~taking_part_strongly(directions)
+    errors = np.where(fixed[:count], deviation[:count] * found.scale[:count], np.inf)
+    parameters = covariance[:count, :count] * np.outer(found.scale[:count], found.scale[:count])
+    both = np.outer(fixed[:count], fixed[:count])
+    correlation = covariance / np.where(deviation > 0, np.outer(deviation, deviation), 1.0)
+    initial = np.where(seen[count:], deviation[count:] * found.scale[count:], np.inf)
+    by_record = initial.reshape(len(problem.samples.inputs), len(problem.free_initial))
+    return Precision(
+        values={name: float(v) for name, v in zip(names, found.values, strict=False)},
+        units={name: model.parameter(name).unit for name in names},
+        standard_errors={name: float(e) for name, e in zip(names, errors, strict=True)},
+        correlations={
+            (names[i], names[j]): float(correlation[i, j]) for i in range(count) for j in range(i) if both[i, j]
+        },
+        covariance=np.where(both, parameters, np.nan),
+        combinations=combinations(found, directions),
+        unfixed=unfixed_directions(problem, found, directions),
+        initial_errors=tuple(
+            {name: float(e) for name, e in zip(problem.free_initial, row, strict=True)} for row in by_record
+        ),
+        noise=words,
+        coloured=noises is not None and any(len(noise.coefficients) for noise in noises),
+    )
+
+
+def taking_part_strongly(directions: Spectrum) -> Bool[np.ndarray, " parameter"]:
+    """Return which parameters take part in a direction of which the record shows nothing."""
+    return taking_part(directions.directions[:, ~np.isfinite(directions.deviation)])

@@ -1,0 +1,152 @@
+"""Directions that a record does not fix, what is fixed all the same, and what would fix them."""
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax import excitation
+from tests import plants
+
+PERIOD = 1e-3
+TIED = {"dead_zone", "saturation", "flow_gain", "feedback_gain"}
+VARIANCE = {"position": 1e-8}
+
+
+def _command(amplitude, duration=1.5, hold_time=0.1):
+    return excitation.pseudo_random_signal(
+        jax.random.key(6), amplitude=amplitude, hold_time=hold_time, duration=duration, sample_period=PERIOD
+    )
+
+
+def _experiment(amplitude, **options):
+    command = _command(amplitude, **options)
+    return ehsvjax.Record(np.arange(len(command)) * PERIOD, {"command": command})
+
+
+FORWARD = ehsvjax.servovalve(transfer_function="forward")
+
+
+@pytest.fixture(scope="module")
+def forward():
+    return ehsvjax.design(FORWARD, _experiment(0.05), noise_variance=VARIANCE)
+
+
+def test_four_parameters_tied_by_the_controller_in_the_forward_path_are_named(forward):
+    (direction,) = forward.unfixed
+    assert direction.structural and np.isinf(direction.deviation)
+    assert set(direction.weights) == TIED
+    # (Gc, d, S, H) -> (c Gc, c d, c S, H/c) leaves the position as it is.
+    signs = {name: np.sign(weight) for name, weight in direction.weights.items()}
+    assert signs["feedback_gain"] == signs["dead_zone"] == signs["saturation"] == -signs["flow_gain"]
+    np.testing.assert_allclose(np.abs(list(direction.weights.values())), 0.5, rtol=1e-3)
+    assert "tells them apart" in direction.remedy
+    assert {name for name, error in forward.standard_errors.items() if np.isinf(error)} == TIED
+    assert np.isfinite(forward.standard_errors["damping_ratio"])
+    assert not any(set(pair) & TIED for pair in forward.correlations)
+
+
+def test_product_and_ratios_that_are_fixed_have_the_errors_of_a_model_with_one_of_the_four_known(forward):
+    assert len(forward.combinations) == 3
+    for combination in forward.combinations:
+        assert set(combination.exponents) <= TIED
+        # Invariant under the transformation that the position does not show.
+        powers = [-e if name == "flow_gain" else e for name, e in combination.exponents.items()]
+        assert sum(powers) == pytest.approx(0.0, abs=1e-6)
+        # With all others of the combination known, it has the error of the one that is left.
+        free, *others = combination.exponents
+        known = FORWARD.with_bounds(fixed={name: FORWARD.nominal[name] for name in others})
+        error = ehsvjax.design(known, _experiment(0.05), noise_variance=VARIANCE).standard_errors[free]
+        assert combination.percent == pytest.approx(100 * error / FORWARD.nominal[free], rel=1e-3)
+
+
+def test_a_fit_says_the_same_as_the_design(forward):
+    command = _command(0.05)
+    time = np.arange(len(command)) * PERIOD
+    # The position that the valve would show, of a plant with the controller in the forward path: the spool's loop is
+    # the same for u' = Gc*u, so that the independent plant serves.
+    motion = plants.servovalve_plant(0.09 * command, PERIOD)
+    noise = np.random.default_rng(4).normal(0.0, 1e-4, len(command))
+    record = ehsvjax.Record(time, {"command": command}, {"position": motion.position + noise})
+    fit = ehsvjax.identify(FORWARD, record, key=jax.random.key(0), population=50, generations=20)
+    precision = fit.precision()
+    (direction,) = precision.unfixed
+    assert set(direction.weights) == TIED and direction.structural
+    assert {c.name for c in precision.combinations} == {c.name for c in forward.combinations}
+    for found, expected in zip(precision.combinations, forward.combinations, strict=True):
+        assert abs(found.value - expected.value) < 5.0 * found.standard_error
+        assert found.percent == pytest.approx(expected.percent, rel=0.3)
+    text = str(fit)
+    assert "not fixed" in text
+    assert all(combination.name in text for combination in precision.combinations)
+
+
+@pytest.fixture(scope="module")
+def gentle():
+    return ehsvjax.design(ehsvjax.servovalve(), _experiment(1.5e-3), noise_variance=VARIANCE)
+
+
+def test_a_saturation_that_is_never_reached_is_said_with_the_amplitude_that_would(gentle):
+    (direction,) = gentle.unfixed
+    assert list(direction.weights) == ["saturation"] and not direction.structural
+    assert np.isinf(gentle.standard_errors["saturation"])
+    assert gentle.combinations == ()
+    words = direction.remedy
+    amplitude = float(words.split("command up to ")[1].split(")")[0])
+    better = ehsvjax.design(ehsvjax.servovalve(), _experiment(amplitude), noise_variance=VARIANCE)
+    assert better.standard_errors["saturation"] / 3e-3 < 0.2
+    # The plant's own spool: at the record's amplitude it stays below the stop, at the other it does not.
+    assert np.max(np.abs(plants.servovalve_plant(_command(1.5e-3), PERIOD).spool)) < 3e-3 + 1e-4
+    assert np.max(np.abs(plants.servovalve_plant(_command(amplitude), PERIOD).spool)) > 3e-3 + 1e-4
+    assert "saturation" in str(gentle) and "not fixed" in str(gentle)
+
+
+def test_saturation_not_reached_and_the_four_tied_are_told_apart():
+    found = ehsvjax.design(FORWARD, _experiment(0.015), noise_variance=VARIANCE)
+    structural, practical = found.unfixed
+    assert structural.structural and set(structural.weights) == TIED
+    assert not practical.structural and list(practical.weights) == ["saturation"]
+    assert "times the amplitude" in practical.remedy
+    assert {n for c in found.combinations for n in c.exponents} == TIED - {"saturation"}
+
+
+def test_with_the_spool_measured_nothing_is_tied():
+    found = ehsvjax.design(FORWARD, _experiment(0.05), noise_variance={"position": 1e-8, "spool": 1e-10})
+    assert found.unfixed == ()
+    assert all(np.isfinite(error) for error in found.standard_errors.values())
+
+
+def test_design_is_the_bound_and_needs_no_outputs():
+    experiment = _experiment(6e-3)
+    found = ehsvjax.design(ehsvjax.servovalve(), experiment, noise_variance=VARIANCE)
+    filled = ehsvjax.Record(experiment.time, experiment.inputs, {"position": np.sin(experiment.time)})
+    bound = ehsvjax.cramer_rao_bound(ehsvjax.servovalve(), filled, noise_variance=VARIANCE)
+    for name, error in found.standard_errors.items():
+        assert error == pytest.approx(bound[name], rel=1e-6)
+    with pytest.raises(ValueError, match="got 'pressure'"):
+        ehsvjax.design(ehsvjax.servovalve(), experiment, noise_variance={"pressure": 1.0})
+
+
+def test_parameters_that_add_up_are_named_with_their_sum():
+    # y = (first + second)*u: only the sum shows, and both may be negative.
+    def measure(parameters, state, inputs, signal):
+        return {"y": signal("y", (parameters["first"] + parameters["second"]) * inputs["u"])}
+
+    model = ehsvjax.Model(
+        name="sum",
+        parameters=tuple(ehsvjax.Parameter(n, n, "", 1.0, -5.0, 5.0) for n in ("first", "second")),
+        initial=(),
+        signals=(ehsvjax.Signal("u", "input", ""), ehsvjax.Signal("y", "sensor", "")),
+        start=lambda parameters, initial, inputs: {"x": 0.0},
+        stepper=ehsvjax.runge_kutta_4(lambda parameters, state, inputs, signal: {"x": 0.0 * state["x"]}),
+        measure=measure,
+        max_step=1.0,
+    )
+    record = ehsvjax.Record(np.arange(50.0), {"u": np.where(np.arange(50) % 2, 1.0, -1.0)})
+    found = ehsvjax.design(model, record, noise_variance={"y": 1.0})
+    (direction,) = found.unfixed
+    assert direction.structural and set(direction.weights) == {"first", "second"}
+    (combination,) = found.combinations
+    assert list(combination.exponents.values()) == pytest.approx([1.0, 1.0])
+    assert combination.value == pytest.approx(2.0)
+    assert combination.standard_error == pytest.approx(50**-0.5, rel=1e-6)
