@@ -49,10 +49,20 @@ def residual_noise(
     residuals: Float[np.ndarray, "record time"],
     measured: Bool[np.ndarray, "record time"],
     colour: str,
+    absorbed: Float[np.ndarray, " lag"] | None = None,
 ) -> ResidualNoise:
-    """Return the noise of one output's standardised residuals; zero where nothing is measured."""
-    covariance = _autocovariance(residuals, measured, _order_tried(int(measured.sum())))
+    """Return the noise of one output's standardised residuals; zero where nothing is measured.
+
+    Args:
+        residuals: standardised.
+        measured: where there is a sample.
+        colour: "white", "coloured" or "auto".
+        absorbed: what the fit took of the autocovariance, see `absorbed_by_the_fit`; None for nothing.
+
+    """
     count = int(measured.sum())
+    covariance = _autocovariance(residuals, residuals, measured, lags_tried(count))
+    covariance = covariance if absorbed is None else covariance + absorbed
     p_value = _ljung_box(covariance, count)
     white = ResidualNoise(p_value, np.zeros(0), float(covariance[0]), float(covariance[0]))
     if colour == "white" or covariance[0] == 0 or (colour == "auto" and not p_value < SUSPICION):
@@ -76,6 +86,40 @@ def meat(
     return np.real(transformed.conj().T @ (spectrum[:, None] * transformed)) / size
 
 
+def absorbed_by_the_fit(
+    jacobian: Float[np.ndarray, "record time parameter"],
+    measured: Bool[np.ndarray, "record time"],
+    noise: ResidualNoise,
+    bread: Float[np.ndarray, "parameter parameter"],
+    inside: Float[np.ndarray, "parameter parameter"],
+) -> Float[np.ndarray, " lag"]:
+    """Return how far the autocovariance of residuals lies below the noise's, as parameters were fitted to it.
+
+    With H = J B J^T the residuals have the covariance (I - H) Sigma (I - H). A noise so slow that it is like few
+    independent samples loses more than the parameters' share of the samples.
+
+    Args:
+        jacobian: rows without a sample are zero.
+        measured: where there is a sample.
+        noise: of this output.
+        bread: B, the inverse of J^T J over all outputs.
+        inside: J^T Sigma J over all outputs.
+
+    """
+    length = jacobian.shape[1]
+    spectrum = noise.spectrum(2 * length)[:, None]
+    through = np.real(np.fft.ifft(spectrum * np.fft.fft(jacobian, 2 * length, axis=1), axis=1))[:, :length]
+    through = np.where(measured[..., None], through, 0.0)
+    taken, once = jacobian @ bread, through @ bread
+    twice = taken @ inside @ bread
+    lags = lags_tried(int(measured.sum()))
+    return (
+        _autocovariance(taken, through, measured, lags)
+        + _autocovariance(once, jacobian, measured, lags)
+        - _autocovariance(twice, jacobian, measured, lags)
+    )
+
+
 def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
     """Return the p-value of white noise (Ljung & Box 1978); NaN for few samples, or none that differ."""
     from scipy.special import chdtrc
@@ -88,21 +132,20 @@ def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
     return float(chdtrc(lags, statistic))
 
 
-def _order_tried(count: int) -> int:
+def lags_tried(count: int) -> int:
     """Return the lags worth estimating: 10 log10(n), as usual, but at most an eighth of the samples."""
     return int(max(1, min(_LAGS * 2, 10 * np.log10(max(count, 2)), count // 8)))
 
 
-def _autocovariance(residuals, measured, lags: int) -> Float[np.ndarray, " lag"]:
-    """Return the autocovariance of what is measured, lags 0 to `lags`, each over the pairs that there are."""
-    values = np.where(measured, residuals, 0.0)
-    length = values.shape[1]
+def _autocovariance(first, second, measured, lags: int) -> Float[np.ndarray, " lag"]:
+    """Return the mean product of two sequences, the second later by 0 to `lags`; zero where nothing is measured."""
+    length = measured.shape[1]
     covariance = []
     for lag in range(min(lags, length - 1) + 1):
         pairs = np.sum(measured[:, : length - lag] & measured[:, lag:])
         # Over all samples, not over the pairs: the sequence then stays positive definite where nothing is missing.
         share = pairs / max(np.sum(measured), 1) if measured.all() else 1.0
-        product = np.sum(values[:, : length - lag] * values[:, lag:])
+        product = np.sum(first[:, : length - lag] * second[:, lag:])
         covariance.append(product / max(pairs, 1) * share)
     return np.array(covariance)
 

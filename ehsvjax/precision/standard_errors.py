@@ -20,7 +20,7 @@ from ehsvjax.precision.directions import (
     taking_part,
 )
 from ehsvjax.precision.remedies import unfixed_directions
-from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, meat, residual_noise
+from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, absorbed_by_the_fit, meat, residual_noise
 from ehsvjax.precision.sensitivities import Sensitivities, sensitivities
 
 _ROUNDING = 1e-8
@@ -146,6 +146,14 @@ def covariance_of(
 
     (J^T J)^-1 times the noise's variance; where the noise is coloured the sandwich with J^T Sigma J inside.
     """
+    bread, seen = bread_of(found)
+    if noises is None or not any(len(noise.coefficients) for noise in noises):
+        return factor * bread, seen
+    return factor * bread @ _inside(found, noises) @ bread, seen
+
+
+def bread_of(found: Sensitivities) -> tuple[Float[np.ndarray, "parameter parameter"], Bool[np.ndarray, " parameter"]]:
+    """Return (J^T J)^-1 without the directions that are rounding, and which unknowns take no part in those."""
     rows = found.rows
     size = np.linalg.norm(rows, axis=0)
     per_size = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
@@ -153,12 +161,19 @@ def covariance_of(
     informed = values > _ROUNDING * max(values[0], np.finfo(float).tiny)
     seen = (size > 0) & (np.linalg.norm(vectors[~informed], axis=0) < 1e-4)
     half = (vectors[informed].T / values[informed]) * per_size[:, None]
-    bread = half @ half.T
-    if noises is None or not any(len(noise.coefficients) for noise in noises):
-        return factor * bread, seen
+    return half @ half.T, seen
+
+
+def _inside(found: Sensitivities, noises: list[ResidualNoise]) -> Float[np.ndarray, "parameter parameter"]:
+    """Return J^T Sigma J over all outputs, for noises of mean variance 1."""
     jacobian = np.where(found.measured[..., None], found.jacobian, 0.0)
-    inside = sum(factor * meat(jacobian[:, :, i], noise) / noise.variance for i, noise in enumerate(noises))
-    return bread @ inside @ bread, seen
+    inside = np.sum([meat(jacobian[:, :, i], noise) for i, noise in enumerate(noises)], axis=0)
+    return inside / _mean_variance(found, noises)
+
+
+def _mean_variance(found: Sensitivities, noises: list[ResidualNoise]) -> float:
+    counts = found.measured.sum(axis=(0, 1))
+    return float(np.sum(counts * [noise.variance for noise in noises]) / np.sum(counts))
 
 
 def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
@@ -174,13 +189,33 @@ def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
     noises = [
         residual_noise(influence[..., i], found.measured[..., i], colour) for i in range(len(problem.noise_variance))
     ]
-    mean_square = float(np.sum(influence**2)) / (count - unknowns)
+    variance = float(np.sum(influence**2)) / (count - unknowns)
+    if any(len(noise.coefficients) for noise in noises):
+        noises = _with_what_the_fit_took(found, influence, noises)
+        variance = _mean_variance(found, noises)
     if given and problem.huber is None:
         factor, source = 1.0, "of the variance given"
     else:
-        factor, source = mean_square / weight**2, "of the residuals' variance"
-    # Only the shape of a coloured noise comes from here; its size is the factor's.
+        factor, source = variance / weight**2, "of the residuals' variance"
     return noises, _sentence(problem, noises, colour, source), factor
+
+
+def _with_what_the_fit_took(found: Sensitivities, influence, noises: list[ResidualNoise]) -> list[ResidualNoise]:
+    """Return the noises estimated again from autocovariances to which what the fit absorbed is added back."""
+    bread, _ = bread_of(found)
+    jacobian = np.where(found.measured[..., None], found.jacobian, 0.0)
+    for _ in range(2):
+        inside = _inside(found, noises) * _mean_variance(found, noises)
+        noises = [
+            residual_noise(
+                influence[..., i],
+                found.measured[..., i],
+                "coloured" if len(noise.coefficients) else "white",
+                absorbed_by_the_fit(jacobian[:, :, i], found.measured[..., i], noise, bread, inside),
+            )._replace(p_value=noise.p_value)
+            for i, noise in enumerate(noises)
+        ]
+    return noises
 
 
 def _sentence(problem: Problem, noises: list[ResidualNoise], colour: str, source: str) -> str:
