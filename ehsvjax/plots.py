@@ -136,7 +136,7 @@ def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
             low, high = min(*inside, profile.interval[0]), max(*inside, profile.interval[1])
             axes.set(title=_words(name), xlabel=f"{prefix}{unit}" if unit else "", ylim=(-2 * quantile, 2 * quantile),
                      xlim=(low / factor, high / factor))  # fmt: skip
-            axes.ticklabel_format(axis="x", useOffset=False)
+            axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4), useOffset=False)
             axes.xaxis.get_major_locator().set_params(nbins=4)
         for axes in every[len(names) :]:
             axes.set_visible(False)
@@ -241,6 +241,8 @@ def _draw_residual(axes, time, residual, unit: str, band: "Band | None" = None) 
               label="measured − model")  # fmt: skip
     axes.axhline(0, color=_AXIS, lw=0.8)
     axes.set_ylabel(f"residual\n{label}")
+    if band is not None:
+        _legend(axes)
 
 
 def _draw_search(axes, fit: Fit) -> None:

@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ehsvjax.precision.sensitivities import Sensitivities
 
@@ -106,11 +106,14 @@ def parameter_root(found: Sensitivities) -> Float[np.ndarray, "parameter paramet
 
 def named(names: Sequence[str], vector: Float[np.ndarray, " parameter"]) -> dict[str, float]:
     """Return the components that count, largest first, the sign such that the largest is positive."""
-    order = np.argsort(-np.abs(vector), kind="stable")
-    # Of equally large ones the first that is named leads.
-    leading = next(i for i in range(len(vector)) if abs(vector[i]) > (1.0 - 1e-6) * abs(vector[order[0]]))
-    sign = np.sign(vector[leading])
+    order = _largest_first(vector)
+    sign = np.sign(vector[order[0]])
     return {names[i]: float(sign * vector[i]) for i in order if abs(vector[i]) > _TAKES_PART * 10}
+
+
+def _largest_first(vector: Float[np.ndarray, " parameter"]) -> Int[np.ndarray, " parameter"]:
+    """Return the order of the components by size, of equal ones that in which they stand."""
+    return np.argsort(-np.round(np.abs(vector), 6), kind="stable")
 
 
 def taking_part(unfixed: Float[np.ndarray, "parameter direction"]) -> np.ndarray:
@@ -150,7 +153,7 @@ def _choices(tied: np.ndarray, count: int) -> list[list[int]]:
 
 
 def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Combination:
-    taking = [i for i in np.argsort(-np.abs(vector), kind="stable") if abs(vector[i]) > _TAKES_PART]
+    taking = [i for i in _largest_first(vector) if abs(vector[i]) > _TAKES_PART]
     names = found.names
     if all(found.relative[i] for i in taking):
         powers = {names[i]: _rounded(vector[i]) for i in taking}

@@ -253,7 +253,8 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
     errors = np.where(fixed[:count], deviation[:count] * found.scale[:count], np.inf)
     parameters = covariance[:count, :count] * np.outer(found.scale[:count], found.scale[:count])
     both = np.outer(fixed[:count], fixed[:count])
-    correlation = covariance / np.where(deviation > 0, np.outer(deviation, deviation), 1.0)
+    per_deviation = np.where(deviation > 0, 1.0 / np.where(deviation > 0, deviation, 1.0), 0.0)
+    correlation = covariance * np.outer(per_deviation, per_deviation)
     initial = np.where(seen[count:], deviation[count:] * found.scale[count:], np.inf)
     by_record = initial.reshape(len(problem.samples.inputs), len(problem.free_initial))
     return Precision(
