@@ -264,12 +264,15 @@ def elitism(
     same = (elites[:, None, :] == population[None, :, :]).all(axis=2) & (elite_cost[:, None] == cost[None, :])
     present = same.any(axis=1)
     # Of a present elite one copy is kept: if all were, there could be too few places for the absent ones.
-    copy = jnp.where(present, same.argmax(axis=1), individuals)
-    kept = jnp.zeros(individuals, bool).at[copy].set(True, mode="drop")
+    numbers = jnp.arange(individuals)[None, :]
+    kept = jnp.any(present[:, None] & (same.argmax(axis=1)[:, None] == numbers), axis=0)
     places = jnp.argsort(jnp.where(kept, 2, draws.uniform(key, (individuals,))))
     absent = ~present & jnp.isfinite(elite_cost)
-    place = jnp.where(absent, places[jnp.cumsum(absent) - 1], individuals)
-    return population.at[place].set(elites, mode="drop"), cost.at[place].set(elite_cost, mode="drop")
+    place = places[jnp.cumsum(absent) - 1]
+    # Chosen by each individual, not scattered by each elite, which takes longer to compile.
+    comes = absent[:, None] & (place[:, None] == numbers)
+    replaced, elite = comes.any(axis=0), comes.argmax(axis=0)
+    return jnp.where(replaced[:, None], elites[elite], population), jnp.where(replaced, elite_cost[elite], cost)
 
 
 def immigrants(key: Key[Array, ""], population: Population, count: int) -> Population:

@@ -127,26 +127,53 @@ def test_design_is_the_bound_and_needs_no_outputs():
         ehsvjax.design(ehsvjax.servovalve(), experiment, noise_variance={"pressure": 1.0})
 
 
-def test_parameters_that_add_up_are_named_with_their_sum():
-    # y = (first + second)*u: only the sum shows, and both may be negative.
-    def measure(parameters, state, inputs, signal):
-        return {"y": signal("y", (parameters["first"] + parameters["second"]) * inputs["u"])}
-
-    model = ehsvjax.Model(
-        name="sum",
-        parameters=tuple(ehsvjax.Parameter(n, n, "", 1.0, -5.0, 5.0) for n in ("first", "second")),
+def _of_two_inputs(output):
+    """Return a model without a state that shows what `output(parameters, inputs)` says, of four parameters."""
+    bounds = {"first": (-5.0, 5.0), "second": (-5.0, 5.0), "third": (0.1, 10.0), "fourth": (0.1, 10.0)}
+    return ehsvjax.Model(
+        name="static",
+        parameters=tuple(ehsvjax.Parameter(name, name, "", 1.0, *ends) for name, ends in bounds.items()),
         initial=(),
-        signals=(ehsvjax.Signal("u", "input", ""), ehsvjax.Signal("y", "sensor", "")),
+        signals=(ehsvjax.Signal("u", "input", ""), ehsvjax.Signal("w", "input", ""), ehsvjax.Signal("y", "sensor", "")),
         start=lambda parameters, initial, inputs: {"x": 0.0},
         stepper=ehsvjax.runge_kutta_4(lambda parameters, state, inputs, signal: {"x": 0.0 * state["x"]}),
-        measure=measure,
+        measure=lambda parameters, state, inputs, signal: {"y": signal("y", output(parameters, inputs))},
         max_step=1.0,
     )
-    record = ehsvjax.Record(np.arange(50.0), {"u": np.where(np.arange(50) % 2, 1.0, -1.0)})
-    found = ehsvjax.design(model, record, noise_variance={"y": 1.0})
+
+
+STATIC = ehsvjax.Record(
+    np.arange(50.0), {"u": np.where(np.arange(50) % 2, 1.0, -1.0), "w": np.where(np.arange(50) % 4 < 2, 1.0, -1.0)}
+)
+
+
+def test_a_sum_and_a_product_that_show_are_named_apart():
+    model = _of_two_inputs(lambda p, i: (p["first"] + p["second"]) * i["u"] + p["third"] * p["fourth"] ** 2 * i["w"])
+    found = ehsvjax.design(model, STATIC, noise_variance={"y": 1.0})
+    assert [direction.structural for direction in found.unfixed] == [True, True]
+    assert {frozenset(d.weights) for d in found.unfixed} == {
+        frozenset(("first", "second")),
+        frozenset(("third", "fourth")),
+    }
+    by_name = {frozenset(c.exponents): c for c in found.combinations}
+    total, product = by_name[frozenset(("first", "second"))], by_name[frozenset(("third", "fourth"))]
+    assert list(total.exponents.values()) == pytest.approx([1.0, 1.0])
+    assert total.value == pytest.approx(2.0)
+    # u and w are orthogonal: each has the error of a mean of 50.
+    assert total.standard_error == pytest.approx(50**-0.5, rel=1e-6)
+    assert product.exponents["fourth"] / product.exponents["third"] == pytest.approx(2.0)
+    assert product.percent / abs(product.exponents["third"]) == pytest.approx(100 * 50**-0.5, rel=1e-6)
+
+
+def test_parameters_that_show_alike_but_weakly_are_not_fixed_and_a_longer_record_is_asked_for():
+    model = _of_two_inputs(lambda p, i: p["first"] * i["u"] + p["third"] * i["w"]).with_bounds(
+        fixed={"second": 1.0, "fourth": 1.0}
+    )
+    found = ehsvjax.design(model, STATIC, noise_variance={"y": 200.0})
+    assert set(found.standard_errors) == {"first", "third"}
     (direction,) = found.unfixed
-    assert direction.structural and set(direction.weights) == {"first", "second"}
-    (combination,) = found.combinations
-    assert list(combination.exponents.values()) == pytest.approx([1.0, 1.0])
-    assert combination.value == pytest.approx(2.0)
-    assert combination.standard_error == pytest.approx(50**-0.5, rel=1e-6)
+    # 50 samples of variance 200: 200% of the third, 20% of the width of the first.
+    assert list(direction.weights) == ["third"] and not direction.structural
+    assert direction.deviation == pytest.approx(2.0, rel=1e-6)
+    assert np.isinf(found.standard_errors["third"]) and np.isfinite(found.standard_errors["first"])
+    assert "times the amplitude" in direction.remedy or "times its length" in direction.remedy

@@ -135,7 +135,7 @@ def combinations(found: Sensitivities, fixed: Spectrum) -> tuple[Combination, ..
     informed = fixed.deviation <= NOT_FIXED
     root = fixed.directions[:, informed] * fixed.deviation[informed]
     candidates = []
-    for pivots in _choices(tied, count):
+    for pivots in _choices(unfixed, tied):
         others = [i for i in tied if i not in pivots]
         weights = -np.linalg.lstsq(unfixed[pivots].T, unfixed[others].T, rcond=None)[0].T
         vectors = np.zeros((len(others), len(unfixed)))
@@ -147,9 +147,14 @@ def combinations(found: Sensitivities, fixed: Spectrum) -> tuple[Combination, ..
     return tuple(_combination(found, vector, error) for vector, error in zip(vectors, errors, strict=True))
 
 
-def _choices(tied: np.ndarray, count: int) -> list[list[int]]:
-    """Return the sets of pivots to try: each parameter alone for one direction, otherwise the first that are apart."""
-    return [[int(i)] for i in tied] if count == 1 else [[int(i) for i in tied[:count]]]
+def _choices(unfixed: Float[np.ndarray, "parameter direction"], tied: np.ndarray) -> list[list[int]]:
+    """Return the sets of pivots to try: each parameter alone for one direction, otherwise those farthest apart."""
+    if unfixed.shape[1] == 1:
+        return [[int(i)] for i in tied]
+    from scipy.linalg import qr
+
+    order = qr(unfixed[tied].T, mode="r", pivoting=True)[1]
+    return [[int(tied[i]) for i in order[: unfixed.shape[1]]]]
 
 
 def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Combination:
