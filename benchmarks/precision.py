@@ -13,6 +13,7 @@ import argparse
 import json
 import multiprocessing
 import os
+import subprocess
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
@@ -114,6 +115,39 @@ def judged(name: str, variance: float, pole: float, found: Draws) -> pd.DataFram
     return table
 
 
+COST = """
+import json, sys, time
+sys.path[:0] = [sys.argv[1]]
+import jax
+import ehsvjax
+from benchmarks import monte_carlo, precision
+
+experiment, record = monte_carlo.servovalve(), monte_carlo.servovalve().record
+position = record.outputs["position"] + precision.noise(0, 1e-8, 0.0, len(record))
+measured = ehsvjax.Record(record.time, record.inputs, {"position": position})
+fit = ehsvjax.identify(experiment.model, measured, key=jax.random.key(0), population=50, generations=20)
+calls = {
+    "precision": fit.precision,
+    "profile_likelihood": fit.profile_likelihood,
+    "bands": fit.bands,
+    "design": lambda: ehsvjax.design(experiment.model, measured, noise_variance={"position": 1e-8}),
+    "bootstrap, 200 draws": lambda: fit.bootstrap(jax.random.key(1)),
+}
+for name, call in calls.items():
+    began = time.perf_counter()
+    call()
+    calls[name] = time.perf_counter() - began
+print(json.dumps(calls))
+"""
+
+
+def cost() -> dict[str, float]:
+    """Return the seconds of each question to a fit of 4,000 samples and six parameters, compiling included."""
+    root = str(Path(__file__).parents[1])
+    printed = subprocess.run([sys.executable, "-c", COST, root], capture_output=True, text=True, check=True).stdout
+    return json.loads(printed.splitlines()[-1])
+
+
 def picture(table: pd.DataFrame) -> Figure:
     """Draw the coverage of every parameter and noise."""
     figure = Figure(figsize=(8, 3.6), layout="constrained")
@@ -158,6 +192,10 @@ def main() -> None:
         f"of a ratio {ratio:.1f}%, of a coverage {white:.1f} and {coloured:.1f} points."
     )
     picture(table).savefig(options.out / "precision.png", dpi=120)
+    seconds = cost()
+    (options.out / "precision_cost.json").write_text(json.dumps(seconds))
+    print("Seconds after an identification in the same process, compiling included: "
+          + ", ".join(f"{name} {taken:.2f}" for name, taken in seconds.items()))  # fmt: skip
 
 
 if __name__ == "__main__":

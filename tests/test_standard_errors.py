@@ -175,6 +175,43 @@ def test_bootstrap_has_the_errors_of_the_closed_form(kind, pole):
     assert high - low == pytest.approx(2 * 1.96 * drawn.standard_errors["gain"], rel=0.2)
 
 
+def test_blocks_of_a_record_that_lacks_an_output():
+    def measure(parameters, state, inputs, signal):
+        y = parameters["gain"] * inputs["force"] + state["x"]
+        return {"y": signal("y", y), "double": signal("double", 2.0 * y)}
+
+    model = _line(signals=(*_line().signals, ehsvjax.Signal("double", "sensor", "m")), measure=measure)
+    first, second = (2.5 * FORCE + 0.4 + TIME + _noise(seed) for seed in (11, 12))
+    records = [
+        ehsvjax.Record(TIME, {"force": FORCE}, {"y": first, "double": 2.0 * (first + _noise(13))}),
+        ehsvjax.Record(TIME, {"force": FORCE}, {"y": second}),
+    ]
+    fit = ehsvjax.identify(model, records, key=jax.random.key(0), population=16, generations=12)
+    drawn = fit.bootstrap(jax.random.key(1), draws=100, kind="block")
+    assert drawn.lost == 0
+    assert drawn.standard_errors["gain"] == pytest.approx(fit.standard_errors["gain"], rel=0.35)
+
+
+def test_huber_has_the_errors_of_robust_regression():
+    noise = _noise(6)
+    noise[::15] += 3.0
+    record = _record(noise)
+    fit = ehsvjax.identify(_line(), record, key=jax.random.key(0), population=16, generations=12, huber=1.345)
+    precision = fit.precision("white")
+    scale = fit.noise_variance["y"] ** 0.5
+    residual = fit.residuals()["y"] / scale
+    inside = np.abs(residual) <= 1.345
+    # Huber 1981, section 7.6: the influence's variance over its mean slope squared.
+    variance = np.sum(np.clip(residual, -1.345, 1.345) ** 2) / (SAMPLES - 2) / np.mean(inside) ** 2
+    expected = scale * np.sqrt(variance * np.linalg.inv(DESIGN.T @ DESIGN)[0, 0])
+    assert precision.standard_errors["gain"] == pytest.approx(expected, rel=1e-6)
+    # A profile of Huber's cost agrees: it has less curvature than the sum of squares.
+    lower, upper = fit.profile_likelihood(noise="white").intervals["gain"]
+    assert upper - lower == pytest.approx(2 * 1.96 * expected, rel=0.05)
+    # And the spikes do not widen the band of samples.
+    assert fit.bands()["y"].measurement.mean() == pytest.approx(1.96 * scale, rel=0.02)
+
+
 def test_draws_repeat_with_the_key():
     first, again = (_fit().bootstrap(jax.random.key(4), draws=8).parameters["gain"] for _ in range(2))
     np.testing.assert_array_equal(first, again)

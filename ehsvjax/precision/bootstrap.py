@@ -60,7 +60,7 @@ def bootstrap(
     values: Float[np.ndarray, " parameter"],
     simulated: Float[np.ndarray, "record time signal"],
     noises: list[ResidualNoise],
-    factor: float,
+    variance: float,
     *,
     key: Key[Array, ""],
     draws: int,
@@ -73,7 +73,7 @@ def bootstrap(
         values: of every unknown of the fit, SI.
         simulated: the fit's outputs, SI.
         noises: of each output's standardised residuals.
-        factor: variance of the noise in units of the problem's.
+        variance: of a sample's noise in units of the problem's.
         key: random key.
         draws: how many.
         kind: "parametric" draws Gaussian noise of the residuals' own colour; "block" puts blocks of the residuals
@@ -88,14 +88,17 @@ def bootstrap(
     if isinstance(draws, bool) or not isinstance(draws, int) or draws < 2:
         raise ValueError(f"expected draws to be a whole number of at least 2, got {draws!r}")
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
-    deviation = np.sqrt(problem.noise_variance * factor)
+    deviation = np.sqrt(problem.noise_variance)
     shape = simulated.shape[:2]
     drawn = np.empty((draws, *simulated.shape))
+    # Residuals are smaller than the noise by what the unknowns took.
+    count = int(problem.samples.measured.sum())
+    fuller = np.sqrt(count / (count - len(values)))
     for i, noise in enumerate(noises):
         if kind == "parametric":
-            relative = _coloured(random, noise, (draws, *shape))
+            relative = np.sqrt(variance) * _coloured(random, noise, (draws, *shape))
         else:
-            residuals = (problem.samples.outputs - simulated)[..., i] / np.sqrt(problem.noise_variance[i] * factor)
+            residuals = fuller * (problem.samples.outputs - simulated)[..., i] / deviation[i]
             relative = _blocks(random, residuals, problem.samples.measured[..., i], noise, draws)
         drawn[..., i] = simulated[..., i] + deviation[i] * relative
     start = np.clip(to_unit(problem.coordinates, values), 0.0, 1.0)
@@ -137,8 +140,10 @@ def _blocks(random: np.random.Generator, residuals, measured, noise: ResidualNoi
     drawn = np.zeros((draws, records, length))
     for record in range(records):
         source = residuals[record][measured[record]]
-        # Residuals are smaller than the noise by what the unknowns took; their mean is the model's error.
-        source = (source - source.mean()) / max(source.std(), np.finfo(float).tiny)
+        if not source.size:
+            continue  # this record does not hold this output
+        # Their mean is the model's error, not the noise's.
+        source = source - source.mean()
         starts = random.integers(0, len(source), (draws, -(-length // block)))
         places = (starts[:, :, None] + np.arange(block)) % len(source)
         drawn[:, record] = source[places.reshape(draws, -1)[:, :length]]

@@ -58,10 +58,11 @@ def profiles(fit: Fit, of: Prepared, names: Sequence[str] | None, level: float) 
     for name in names:
         if name not in of.problem.free:
             raise ValueError(f"expected parameters that were identified, {', '.join(of.problem.free)}; got {name!r}")
-    found, _, factor, _, covariance, seen = of.first_order
+    found, _, factor, curvature, _, covariance, seen = of.first_order
     deviation = np.sqrt(np.diagonal(covariance_of(found, None, factor)[0]))
     # Where the noise is coloured the cost rises too fast by the ratio of the variances (Rotnitzky & Jewell 1990).
     ratio = np.diagonal(covariance) / np.where(deviation > 0, deviation**2, 1.0)
+    factor = factor * curvature
     factors = {name: float(factor * (ratio[i] if seen[i] else 1.0)) for i, name in enumerate(of.problem.free)}
     scale = found.scale
     return profile_likelihood(
@@ -79,10 +80,10 @@ def profiles(fit: Fit, of: Prepared, names: Sequence[str] | None, level: float) 
 
 def draws(fit: Fit, of: Prepared, key: Key[Array, ""], count: int, kind: str) -> Bootstrap:
     """Return the bootstrap."""
-    del fit
-    found, noises, factor, *_ = of.first_order
+    found, noises, *_ = of.first_order
     assert noises is not None
-    return bootstrap(of.problem, of.values, found.simulated, noises, factor, key=key, draws=count, kind=kind)
+    variance = _sample_variance(fit, of)
+    return bootstrap(of.problem, of.values, found.simulated, noises, variance, key=key, draws=count, kind=kind)
 
 
 def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict[str, Band]:
@@ -93,7 +94,7 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
 
     """
     quantile = quantile_of(level)
-    found, _, factor, _, covariance, _ = of.first_order
+    found, covariance, factor = of.first_order.found, of.first_order.covariance, _sample_variance(fit, of)
     noise = np.sqrt(of.problem.noise_variance)
     for i, fitted in enumerate(fit.records):
         if fitted is record:
@@ -111,6 +112,11 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
     variance = np.einsum("...p,pq,...q->...", by_parameters, covariance[:count, :count], by_parameters)
     spread = np.sqrt(np.maximum(variance + factor * np.sum(by_initial**2, axis=-1), 0.0))[0]
     return _bands(problem.observed, spread, np.sqrt(problem.noise_variance), factor, quantile)
+
+
+def _sample_variance(fit: Fit, of: Prepared) -> float:
+    """Return the variance of a sample's noise in units of the problem's, with Huber's cost that of its core."""
+    return of.first_order.factor if fit.huber is None else 1.0
 
 
 def _bands(names, spread, noise, factor, quantile) -> dict[str, Band]:

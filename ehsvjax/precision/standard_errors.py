@@ -93,7 +93,8 @@ class Linearised(NamedTuple):
     Attributes:
         found: the sensitivities.
         noises: of each output's residuals; None where the noise is expected, not seen.
-        factor: the noise's variance in units of the problem's.
+        factor: the noise's variance in units of the problem's, as it counts for the parameters.
+        curvature: of the cost, over that of the sum of squares: below 1 where large residuals weigh linearly.
         words: what noise was counted on, and why.
         covariance: `[parameter, parameter]` of the unknowns, each in its unit.
         seen: `[parameter]` which of them the record shows apart at all.
@@ -103,6 +104,7 @@ class Linearised(NamedTuple):
     found: Sensitivities
     noises: list[ResidualNoise] | None
     factor: float
+    curvature: float
     words: str
     covariance: Float[np.ndarray, "parameter parameter"]
     seen: Bool[np.ndarray, " parameter"]
@@ -132,11 +134,11 @@ def linearised(
     if colour not in ("auto", "white", "coloured"):
         raise ValueError(f"expected noise to be 'auto', 'white' or 'coloured', got {colour!r}")
     found = sensitivities(problem, values)
-    noises, factor, words = None, 1.0, "white, of the variance given"
+    noises, factor, curvature, words = None, 1.0, 1.0, "white, of the variance given"
     if not expected:
-        noises, words, factor = _noise(problem, found, noise_variance_given, colour)
+        noises, factor, curvature, words = _noise(problem, found, noise_variance_given, colour)
     covariance, seen = covariance_of(found, noises, factor)
-    return Linearised(found, noises, factor, words, covariance, seen)
+    return Linearised(found, noises, factor, curvature, words, covariance, seen)
 
 
 def covariance_of(
@@ -177,15 +179,15 @@ def _mean_variance(found: Sensitivities, noises: list[ResidualNoise]) -> float:
 
 
 def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
-    """Return each output's noise, a sentence about it, and the variance in units of the problem's."""
+    """Return each output's noise, the variance in units of the problem's, the cost's curvature, and a sentence."""
     standardised = (problem.samples.outputs - found.simulated) / np.sqrt(problem.noise_variance)
     standardised = np.where(found.measured, standardised, 0.0)
     count, unknowns = int(found.measured.sum()), len(found.values)
     # The influence of a residual, and how much of a step of the parameters it undoes (Huber 1981, section 7.6).
-    influence, weight = standardised, 1.0
+    influence, curvature = standardised, 1.0
     if problem.huber is not None:
         influence = np.clip(standardised, -problem.huber, problem.huber)
-        weight = float(np.mean(np.abs(standardised[found.measured]) <= problem.huber))
+        curvature = float(np.mean(np.abs(standardised[found.measured]) <= problem.huber))
     noises = [
         residual_noise(influence[..., i], found.measured[..., i], colour) for i in range(len(problem.noise_variance))
     ]
@@ -196,8 +198,8 @@ def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
     if given and problem.huber is None:
         factor, source = 1.0, "of the variance given"
     else:
-        factor, source = variance / weight**2, "of the residuals' variance"
-    return noises, _sentence(problem, noises, colour, source), factor
+        factor, source = variance / curvature**2, "of the residuals' variance"
+    return noises, factor, curvature, _sentence(problem, noises, colour, source)
 
 
 def _with_what_the_fit_took(found: Sensitivities, influence, noises: list[ResidualNoise]) -> list[ResidualNoise]:
@@ -244,7 +246,7 @@ def _sentence(problem: Problem, noises: list[ResidualNoise], colour: str, source
 
 def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
     """Return what a person wants to know of a fit to first order."""
-    found, noises, factor, words, covariance, seen = fit
+    found, noises, factor, _, words, covariance, seen = fit
     directions = spectrum(parameter_root(found) / np.sqrt(factor))
     count, names = len(found.names), list(found.names)
     deviation = np.sqrt(np.diagonal(covariance))
