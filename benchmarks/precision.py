@@ -40,11 +40,12 @@ EXPERIMENTS = {"van_der_pol": monte_carlo.van_der_pol, "servovalve": monte_carlo
 
 
 class Draws(NamedTuple):
-    """Of many identifications, `[draw, parameter]`: estimates, their standard errors, and what noise was seen."""
+    """Of many identifications, `[draw, parameter, ...]`: estimates, their errors, and what noise was seen."""
 
     alone: np.ndarray
     refined: np.ndarray
     errors: np.ndarray
+    intervals: np.ndarray
     coloured: np.ndarray
     converged: np.ndarray
 
@@ -69,6 +70,7 @@ def identified(name: str, variance: float, pole: float, seeds: range) -> Draws:
                 [fit.history.best[n][-1] for n in names],
                 [fit.parameters[n] for n in names],
                 [precision.standard_errors[n] for n in names],
+                [precision.intervals()[n] for n in names],
                 precision.coloured,
                 fit.effort.converged,
             )
@@ -98,7 +100,7 @@ def judged(name: str, variance: float, pole: float, found: Draws) -> pd.DataFram
     names, truth = list(experiment.truth), np.array(list(experiment.truth.values()))
     bound = ehsvjax.cramer_rao_bound(experiment.model, experiment.record, noise_variance={"position": variance})
     limit = np.array([bound[n] for n in names])
-    inside = np.abs(found.refined - truth) <= 1.959964 * found.errors
+    inside = (found.intervals[..., 0] <= truth) & (truth <= found.intervals[..., 1])
     table = pd.DataFrame({"model": name, "variance": variance, "noise": "AR(1) 0.9" if pole else "white",
                           "parameter": names})  # fmt: skip
     if not pole:

@@ -93,8 +93,9 @@ def test_linear_model_has_the_errors_of_least_squares(missing):
     assert precision.standard_errors["gain"] == pytest.approx(covariance[0, 0] ** 0.5, rel=1e-6)
     assert precision.initial_errors[0]["start"] == pytest.approx(covariance[1, 1] ** 0.5, rel=1e-6)
     assert precision.covariance[0, 0] == pytest.approx(covariance[0, 0], rel=1e-6)
-    half = 1.959964 * covariance[0, 0] ** 0.5
-    assert precision.intervals()["gain"] == pytest.approx((estimate[0] - half, estimate[0] + half))
+    # The gain is searched by its logarithm.
+    factor = np.exp(1.959964 * covariance[0, 0] ** 0.5 / estimate[0])
+    assert precision.intervals()["gain"] == pytest.approx((estimate[0] / factor, estimate[0] * factor))
     assert precision.unfixed == () and precision.combinations == ()
 
 

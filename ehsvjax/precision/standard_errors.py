@@ -41,6 +41,7 @@ class Precision:
         initial_errors: for each record, name -> standard deviation of the initial conditions estimated, SI.
         noise: what noise was counted on, and why, in a sentence.
         coloured: whether correlated noise was counted on.
+        logarithmic: names of the parameters that are searched by their logarithm.
 
     """
 
@@ -54,17 +55,28 @@ class Precision:
     initial_errors: tuple[dict[str, float], ...]
     noise: str
     coloured: bool
+    logarithmic: tuple[str, ...]
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return name -> (lower, upper) of each parameter by its standard error; infinite where it is not fixed.
+
+        Symmetric on the scale on which the parameter is searched: on a logarithmic one it reaches the same factor up
+        and down. Where errors are a tenth of the value and more that holds the truth more often.
 
         Raises:
             ValueError: unless the level is between 0 and 1.
 
         """
         quantile = quantile_of(level)
-        return {n: (v - quantile * self.standard_errors[n], v + quantile * self.standard_errors[n])
-                for n, v in self.values.items()}  # fmt: skip
+        found = {}
+        for name, value in self.values.items():
+            reach = quantile * self.standard_errors[name]
+            if name in self.logarithmic and np.isfinite(reach):
+                factor = float(np.exp(reach / value))
+                found[name] = (value / factor, value * factor)
+            else:
+                found[name] = (value - reach, value + reach)
+        return found
 
     def __str__(self) -> str:
         """Return the table of parameters, correlations above 0.5, and what is not fixed."""
@@ -274,6 +286,7 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
         ),
         noise=words,
         coloured=noises is not None and any(len(noise.coefficients) for noise in noises),
+        logarithmic=tuple(name for name in names if model.parameter(name).scale == "log"),
     )
 
 
