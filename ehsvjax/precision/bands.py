@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.precision.sensitivities import Sensitivities
+from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities
 
 
 class Band(NamedTuple):
@@ -41,7 +41,7 @@ def total_sensitivities(
     size = np.linalg.norm(initial, axis=0)
     kept = size > 0
     basis, values, vectors = np.linalg.svd(initial[:, kept] / size[kept], full_matrices=False)
-    informed = values > 1e-8 * max(values[0], np.finfo(float).tiny) if len(values) else np.zeros(0, bool)
+    informed = values > ROUNDING * max(values[0], np.finfo(float).tiny) if len(values) else np.zeros(0, bool)
     to_units = (vectors[informed].T / values[informed]) / size[kept][:, None]
     own = found.jacobian[..., count:][..., kept] @ to_units
     following = basis[:, informed].T @ found.rows[:, :count]

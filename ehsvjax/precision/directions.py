@@ -11,13 +11,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ehsvjax.precision.sensitivities import Sensitivities
+from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities
 
 NOT_FIXED = 1.0
 """Standard deviation from which on a direction is not fixed: 100% of the value, or the width of the bounds."""
 
-# Singular values below this share of the largest are rounding in float64.
-_ROUNDING = 1e-8
 # Components of a unit vector below this do not count as taking part.
 _TAKES_PART = 1e-4
 
@@ -89,7 +87,7 @@ class Spectrum(NamedTuple):
 def spectrum(root: Float[np.ndarray, "parameter parameter"]) -> Spectrum:
     """Return the singular directions of the free parameters from a root of their information."""
     values, vectors = np.linalg.svd(root)[1:]
-    seen = values > _ROUNDING * max(values[0], np.finfo(float).tiny)
+    seen = values > ROUNDING * max(values[0], np.finfo(float).tiny)
     return Spectrum(vectors.T, np.where(seen, 1.0 / np.where(seen, values, 1.0), np.inf))
 
 
@@ -100,7 +98,7 @@ def parameter_root(found: Sensitivities) -> Float[np.ndarray, "parameter paramet
     size = np.linalg.norm(nuisance, axis=0)
     basis, triangle = np.linalg.qr(nuisance[:, size > 0] / size[size > 0])
     # Initial conditions that cannot be told apart span fewer dimensions than there are of them.
-    basis = basis[:, np.abs(np.diagonal(triangle)) > _ROUNDING]
+    basis = basis[:, np.abs(np.diagonal(triangle)) > ROUNDING]
     return np.asarray(np.linalg.qr(parameters - basis @ (basis.T @ parameters), mode="r"))
 
 

@@ -8,13 +8,12 @@ from jaxtyping import Float
 
 from ehsvjax.population import Problem
 from ehsvjax.precision.directions import Direction, Spectrum, named, parameter_root, spectrum
-from ehsvjax.precision.sensitivities import Sensitivities, sensitivities
+from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, sensitivities
 
 # Amplitudes of the inputs that are tried, in those of the record.
 _AMPLITUDES = (0.1, 0.3, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 # A direction counts as fixed by another amplitude once it is known to this share.
 _WELL_FIXED = 0.2
-_ROUNDING = 1e-8
 
 
 def unfixed_directions(problem: Problem, found: Sensitivities, here: Spectrum) -> tuple[Direction, ...]:
@@ -51,7 +50,7 @@ def _shown_by_none(
 ) -> Float[np.ndarray, "parameter direction"]:
     balanced = [root / max(np.linalg.norm(root), np.finfo(float).tiny) for root in roots]
     values, vectors = np.linalg.svd(np.concatenate(balanced))[1:]
-    return vectors[values <= _ROUNDING * values[0]].T
+    return vectors[values <= ROUNDING * values[0]].T
 
 
 def _besides(

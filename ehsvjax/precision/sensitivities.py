@@ -10,6 +10,9 @@ from jaxtyping import Bool, Float
 
 from ehsvjax.population import Coordinates, Problem, cast, simulated
 
+ROUNDING = 1e-8
+"""Singular values of sensitivities below this share of the largest are rounding in float64."""
+
 
 class Sensitivities(NamedTuple):
     """The model linearised about one point, every unknown in a unit of its own.

@@ -21,9 +21,7 @@ from ehsvjax.precision.directions import (
 )
 from ehsvjax.precision.remedies import unfixed_directions
 from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, absorbed_by_the_fit, meat, residual_noise
-from ehsvjax.precision.sensitivities import Sensitivities, sensitivities
-
-_ROUNDING = 1e-8
+from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, sensitivities
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +170,7 @@ def bread_of(found: Sensitivities) -> tuple[Float[np.ndarray, "parameter paramet
     size = np.linalg.norm(rows, axis=0)
     per_size = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
     values, vectors = np.linalg.svd(np.linalg.qr(rows * per_size, mode="r"))[1:]
-    informed = values > _ROUNDING * max(values[0], np.finfo(float).tiny)
+    informed = values > ROUNDING * max(values[0], np.finfo(float).tiny)
     seen = (size > 0) & (np.linalg.norm(vectors[~informed], axis=0) < 1e-4)
     half = (vectors[informed].T / values[informed]) * per_size[:, None]
     return half @ half.T, seen
