@@ -1,12 +1,13 @@
 """Are the errors as small as they can be, and the intervals as wide as they should be? Many draws of noise.
 
-    python benchmarks/precision.py [--draws 1000] [--coloured 400] [--model both] [--out out/benchmarks]
+    python benchmarks/precision.py [--draws 1000] [--coloured 400] [--profiles 400] [--model both]
 
 The plant is the independent simulator of tests/plants.py. Under white noise of each of the paper's variances: the root
 mean squared error over the Cramer-Rao bound, for the genetic algorithm alone, with refinement, and for the paper's own
 draw; and how often the 95% intervals of `fit.precision()` hold the truth. Under noise of the same variance that
 remembers 0.9 of itself from sample to sample (at 1 kHz for the servovalve) least squares is not efficient: the
-intervals are to hold the truth all the same. Draws are shared out to processes, one on each core.
+intervals are to hold the truth all the same. At each model's largest variance, where linear theory is at its limit,
+profile likelihood is asked as well, of the first draws. Draws are shared out to processes, one on each core.
 """
 
 import argparse
@@ -40,18 +41,22 @@ EXPERIMENTS = {"van_der_pol": monte_carlo.van_der_pol, "servovalve": monte_carlo
 
 
 class Draws(NamedTuple):
-    """Of many identifications, `[draw, parameter, ...]`: estimates, their errors, and what noise was seen."""
+    """Of many identifications, `[draw, parameter, ...]`: estimates, their errors, and what noise was seen.
+
+    `profiles` are intervals by profile likelihood, NaN for a draw of which they were not asked.
+    """
 
     alone: np.ndarray
     refined: np.ndarray
     errors: np.ndarray
     intervals: np.ndarray
+    profiles: np.ndarray
     coloured: np.ndarray
     converged: np.ndarray
 
 
-def identified(name: str, variance: float, pole: float, seeds: range) -> Draws:
-    """Identify one record for each seed, in whatever process this is."""
+def identified(name: str, variance: float, pole: float, seeds: range, profiled: int) -> Draws:
+    """Identify one record for each seed, in whatever process this is; ask the first `profiled` seeds for profiles."""
     experiment = EXPERIMENTS[name]()
     record, names = experiment.record, list(experiment.truth)
     rows = []
@@ -65,12 +70,14 @@ def identified(name: str, variance: float, pole: float, seeds: range) -> Draws:
             generations=experiment.generations,
         )
         precision = fit.precision()
+        profile = fit.profile_likelihood().intervals if seed < profiled else dict.fromkeys(names, (np.nan, np.nan))
         rows.append(
             (
                 [fit.history.best[n][-1] for n in names],
                 [fit.parameters[n] for n in names],
                 [precision.standard_errors[n] for n in names],
                 [precision.intervals()[n] for n in names],
+                [profile[n] for n in names],
                 precision.coloured,
                 fit.effort.converged,
             )
@@ -85,10 +92,10 @@ def noise(seed: int, variance: float, pole: float, count: int) -> np.ndarray:
     return (variance * (1.0 - pole**2)) ** 0.5 * lfilter([1.0], [1.0, -pole], white)[settling:]
 
 
-def gather(pool, name: str, variance: float, pole: float, draws: int) -> Draws:
+def gather(pool, name: str, variance: float, pole: float, draws: int, profiled: int) -> Draws:
     """Return all draws, of every process."""
     chunks = [range(start, min(start + CHUNK, draws)) for start in range(0, draws, CHUNK)]
-    waiting = [pool.submit(identified, name, variance, pole, chunk) for chunk in chunks]
+    waiting = [pool.submit(identified, name, variance, pole, chunk, profiled) for chunk in chunks]
     label = f"{name}, variance {variance:g}, {'coloured' if pole else 'white'}"
     done = [future.result() for future in tqdm(waiting, desc=label, mininterval=10.0)]
     return Draws(*(np.concatenate(column) for column in zip(*done, strict=True)))
@@ -100,7 +107,10 @@ def judged(name: str, variance: float, pole: float, found: Draws) -> pd.DataFram
     names, truth = list(experiment.truth), np.array(list(experiment.truth.values()))
     bound = ehsvjax.cramer_rao_bound(experiment.model, experiment.record, noise_variance={"position": variance})
     limit = np.array([bound[n] for n in names])
-    inside = (found.intervals[..., 0] <= truth) & (truth <= found.intervals[..., 1])
+    inside, profiled = (
+        (interval[..., 0] <= truth) & (truth <= interval[..., 1]) for interval in (found.intervals, found.profiles)
+    )
+    asked = np.isfinite(found.profiles).all(axis=(1, 2))
     table = pd.DataFrame({"model": name, "variance": variance, "noise": "AR(1) 0.9" if pole else "white",
                           "parameter": names})  # fmt: skip
     if not pole:
@@ -109,6 +119,8 @@ def judged(name: str, variance: float, pole: float, found: Draws) -> pd.DataFram
         table["GA+refinement: RMSE/bound"] = np.sqrt(np.mean((found.refined - truth) ** 2, axis=0)) / limit
         table["paper's error/bound"] = ([experiment.paper[variance][n] for n in names] - truth) / limit
     table["coverage of 95% intervals, %"] = 100 * np.mean(inside, axis=0)
+    if asked.any():
+        table["coverage of profiles, %"] = 100 * np.mean(profiled[asked], axis=0)
     table["mean standard error/RMSE"] = np.mean(np.where(np.isfinite(found.errors), found.errors, np.nan), axis=0) \
         / np.std(found.refined, axis=0)  # fmt: skip
     table["not fixed, %"] = 100 * np.mean(np.isinf(found.errors), axis=0)
@@ -169,6 +181,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--draws", type=int, default=1000, help="under white noise")
     parser.add_argument("--coloured", type=int, default=400, help="under coloured noise")
+    parser.add_argument("--profiles", type=int, default=400, help="of each noise at a model's largest variance")
     parser.add_argument("--model", choices=[*EXPERIMENTS, "both"], default="both")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
@@ -181,7 +194,9 @@ def main() -> None:
                 continue
             for variance in make().paper:
                 for pole, draws in ((0.0, options.draws), (POLE, options.coloured)):
-                    tables.append(judged(name, variance, pole, gather(pool, name, variance, pole, draws)))
+                    profiled = min(options.profiles, draws) if variance == max(make().paper) else 0
+                    found = gather(pool, name, variance, pole, draws, profiled)
+                    tables.append(judged(name, variance, pole, found))
                     # What has been measured is kept, even if the rest is interrupted.
                     table = pd.concat(tables, ignore_index=True)
                     rows = json.loads(table.to_json(orient="records"))
