@@ -148,6 +148,8 @@ def scan_model(
         the last carry, and what was kept, stacked `[time, ...]`.
 
     """
+    if equations.prepare is not None:
+        inputs = equations.prepare(parameters, inputs, sample_period)
     following = jnp.concatenate([inputs[1:], inputs[-1:]]) if grid.hold == "linear" else inputs
 
     def named(row):

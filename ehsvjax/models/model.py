@@ -9,14 +9,16 @@ of all parameters as a dict `name -> scalar`:
 
 `stepper` is called once per individual, outside the time loop: what does not change from step to step is computed
 there. In `step`, `inputs(fraction)` gives the inputs at that fraction of the step, as a dict. Every line of the
-diagram that physics could disturb passes through `signal(name, value, **context)`, the identity of the nominal model.
+diagram that physics could disturb passes through `signal(name, value, **context)`, the identity of the nominal model;
+the context is what an effect there may depend on (a force: `position=`, `velocity=`).
+
+A fourth, `prepare(parameters, inputs, sample_period) -> inputs`, may change the whole series of an input beforehand.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
-Kind = Literal["input", "displacement", "pressure", "flow", "force", "sensor"]
 State = Any
 Inputs = Callable[[float], dict[str, Any]]
 
@@ -43,11 +45,13 @@ class Parameter(NamedTuple):
 class Signal(NamedTuple):
     """A named line of the block diagram, with its kind and its unit.
 
-    Lines of kind "input" are the model's inputs, lines of kind "sensor" its outputs.
+    Lines of kind "input" are the model's inputs, lines of kind "sensor" its outputs. The kind says which effects can
+    act there (`ehsvjax.effects`): a "force" drives the motion, a "load" resists it, "friction" is the size of a force
+    against the velocity (a model steps it without chatter), a "displacement" is any other length.
     """
 
     name: str
-    kind: Kind
+    kind: str
     unit: str
 
 
@@ -59,6 +63,7 @@ class Equations(NamedTuple):
     measure: Callable[..., dict[str, Any]]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    prepare: Callable[..., Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -70,8 +75,8 @@ class Model:
         parameters: the unknowns and the constants.
         initial: the unknown initial conditions, one set for each record.
         signals: the named lines of the diagram; the inputs and outputs among them.
-        start, stepper, measure: the equations, see the module's docstring. Use module-level functions, or cached
-            factories of them: the same function object is compiled once.
+        start, stepper, measure, prepare: the equations, see the module's docstring. Use module-level functions, or
+            cached factories of them: the same function object is compiled once.
         max_step: longest integration step, s; a sample is divided into as many equal steps as this needs.
         options: how the model was made, for prints and for `Fit.save`.
 
@@ -91,6 +96,7 @@ class Model:
     measure: Callable[..., dict[str, Any]]
     max_step: float
     options: tuple[tuple[str, Any], ...] = ()
+    prepare: Callable[..., Any] | None = None
 
     def __post_init__(self):
         """Refuse what cannot be a model."""
@@ -135,7 +141,7 @@ class Model:
     @property
     def equations(self) -> Equations:
         """What is traced and compiled."""
-        return Equations(self.start, self.stepper, self.measure, self.inputs, self.outputs)
+        return Equations(self.start, self.stepper, self.measure, self.inputs, self.outputs, self.prepare)
 
     def parameter(self, name: str) -> Parameter:
         """Return the parameter, constant or initial condition of that name.

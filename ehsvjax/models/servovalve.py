@@ -114,11 +114,17 @@ def servovalve(
         ),
         signals=(
             Signal("command", "input", "m"),
-            *(() if open_loop else (Signal("feedback", "displacement", "m"),)),
-            Signal("filtered", "displacement", "m"),
-            Signal("opening", "displacement", "m"),
-            Signal("supply", "pressure", "Pa"),
-            Signal("load_force", "force", "N"),
+            *(() if open_loop else (Signal("feedback", "feedback", "m"),)),
+            Signal("drive", "drive", "m"),
+            Signal("filtered", "spool", "m"),
+            Signal("spool_rate", "rate", "m/s"),
+            Signal("opening", "opening", "m"),
+            Signal("supply", "supply", "Pa"),
+            Signal("load_force", "load", "N"),
+            Signal("load_friction", "friction", "N"),
+            Signal("retraction_area", "area", "m^2"),
+            Signal("leakage_coefficient", "leakage", "m^3/(s Pa)"),
+            Signal("hydraulic_capacitance", "capacitance", "m^3/Pa"),
             Signal("position", "sensor", "m"),
             Signal("spool", "sensor", "m"),
             Signal("load_pressure", "sensor", "Pa"),
@@ -157,32 +163,42 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
     def drive(parameters, command, position, signal):
         """Input of the transfer function, m."""
         if open_loop:
-            return command
+            return signal("drive", command)
         gain = parameters["feedback_gain"]
         feedback = signal("feedback", position)
-        return {
+        e = {
             "valve": lambda: command - gain * feedback,
             "forward": lambda: gain * (command - feedback),
             "return": lambda: gain * feedback,
         }[transfer_function]()
+        return signal("drive", e)
 
-    def spool_of(command, filtered, signal):
+    def spool_of(parameters, command, filtered, signal):
         """Spool position before dead zone and saturation, m."""
-        filtered = signal("filtered", filtered)
-        return command - filtered if transfer_function == "return" else filtered
+        spool = command - filtered if transfer_function == "return" else filtered
+        return signal("filtered", spool, dead_zone=parameters["dead_zone"])
 
     def opening_of(parameters, spool, signal):
         """Opening of the orifices, m: dead zone, then saturation."""
-        opened = spool - jnp.clip(spool, -parameters["dead_zone"], parameters["dead_zone"])
-        limited = jnp.clip(opened, -parameters["saturation"], parameters["saturation"])
-        return signal("opening", limited, spool=spool)
+        dead_zone, saturation = parameters["dead_zone"], parameters["saturation"]
+        opened = spool - jnp.clip(spool, -dead_zone, dead_zone)
+        limited = jnp.clip(opened, -saturation, saturation)
+        return signal("opening", limited, spool=spool, dead_zone=dead_zone, saturation=saturation)
+
+    def limited(before, filtered, filtered_rate, per_duration, signal):
+        """The transfer function's output and its rate, where the spool cannot move as fast as it should."""
+        rate = (filtered - before) * per_duration
+        possible = signal("spool_rate", rate)
+        if possible is rate:
+            return filtered, filtered_rate
+        return before + possible / per_duration, signal("spool_rate", filtered_rate)
 
     def start(parameters, initial, inputs):
         """Position and filter as given; the velocity that the valve's flow gives at once, for it settles in 0.2 ms."""
         position = initial["initial_position"]
         filtered = initial["initial_filtered"]
         command = inputs["command"]
-        opening = opening_of(parameters, spool_of(command, filtered, identity), identity)
+        opening = opening_of(parameters, spool_of(parameters, command, filtered, identity), identity)
         per_area = 1.0 / parameters["piston_area"]
         load_pressure = parameters["stiffness"] * per_area * position
         flow = hydraulics.load_flow(parameters["flow_gain"], opening, parameters["supply_pressure"], load_pressure)
@@ -197,12 +213,12 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
     def stepper(parameters, step_size, signal):
         """Return one step: the transfer function exactly, for an input drawn as a straight line; the load by SDIRK."""
         stage_size = SDIRK_GAMMA * step_size
-        per_stage_size = 1.0 / stage_size
+        per_stage_size, per_step_size = 1.0 / stage_size, 1.0 / step_size
         to_stage, to_end = (
             second_order_filter(parameters["damping_ratio"], parameters["natural_frequency"], duration)
             for duration in (stage_size, step_size)
         )
-        load_stage = _load_stage(parameters, stage_size)
+        load_stage = _load_stage(parameters, stage_size, signal)
 
         def spool_drive(command, position, opening_state):
             e = drive(parameters, command, position, signal)
@@ -212,26 +228,31 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
             command_start, command_stage, command_end = (
                 signal("command", inputs(fraction)["command"]) for fraction in (0.0, SDIRK_GAMMA, 1.0)
             )
-            supply = signal("supply", parameters["supply_pressure"])
-            force = signal("load_force", 0.0, position=state.position, velocity=state.velocity)
+            flow = parameters["piston_area"] * state.velocity
+            supply = signal("supply", parameters["supply_pressure"], flow=flow)
+            motion = {"position": state.position, "velocity": state.velocity}
+            force = signal("load_force", 0.0, **motion)
+            friction = signal("load_friction", 0.0, **motion)
 
-            opening = opening_of(parameters, spool_of(command_start, state.filtered, signal), signal)
+            opening = opening_of(parameters, spool_of(parameters, command_start, state.filtered, signal), signal)
             e = spool_drive(command_start, state.position, (opening, supply, state.load_pressure))
 
             # First stage. The drive's slope is predicted from the velocity: an error of third order in the spool.
             predicted = state.position + stage_size * state.velocity
             e_predicted = spool_drive(command_stage, predicted, (opening, supply, state.load_pressure))
-            filtered, _ = to_stage(state.filtered, state.filtered_rate, e, (e_predicted - e) * per_stage_size)
-            opening = opening_of(parameters, spool_of(command_stage, filtered, signal), signal)
+            filtered, rate = to_stage(state.filtered, state.filtered_rate, e, (e_predicted - e) * per_stage_size)
+            filtered, _ = limited(state.filtered, filtered, rate, per_stage_size, signal)
+            opening = opening_of(parameters, spool_of(parameters, command_stage, filtered, signal), signal)
             position, velocity, pressure = load_stage(
-                state.position, state.velocity, state.load_pressure, opening, supply, force
+                state.position, state.velocity, state.load_pressure, opening, supply, force, friction
             )
 
             # Second stage, from the state that the first stage's rates lead to.
             e_stage = spool_drive(command_stage, position, (opening, supply, pressure))
             filtered, filtered_rate = to_end(state.filtered, state.filtered_rate, e, (e_stage - e) * per_stage_size)
+            filtered, filtered_rate = limited(state.filtered, filtered, filtered_rate, per_step_size, signal)
             carried = (1.0 - SDIRK_GAMMA) / SDIRK_GAMMA
-            opening = opening_of(parameters, spool_of(command_end, filtered, signal), signal)
+            opening = opening_of(parameters, spool_of(parameters, command_end, filtered, signal), signal)
             position, velocity, pressure = load_stage(
                 state.position + carried * (position - state.position),
                 state.velocity + carried * (velocity - state.velocity),
@@ -239,16 +260,17 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
                 opening,
                 supply,
                 force,
+                friction,
             )
             return ServovalveState(position, velocity, filtered, filtered_rate, pressure)
 
         return step
 
     def measure(parameters, state, inputs, signal):
-        del parameters
-        spool = spool_of(signal("command", inputs["command"]), state.filtered, signal)
+        spool = spool_of(parameters, signal("command", inputs["command"]), state.filtered, signal)
+        load_force = parameters["piston_area"] * state.load_pressure
         return {
-            "position": signal("position", state.position, velocity=state.velocity),
+            "position": signal("position", state.position, velocity=state.velocity, load_force=load_force),
             "spool": signal("spool", spool),
             "load_pressure": signal("load_pressure", state.load_pressure),
         }
@@ -256,7 +278,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
     return _Equations(start, stepper, measure)
 
 
-def _load_stage(parameters, h):
+def _load_stage(parameters, h, signal):
     """Return the implicit stage of length h: position, velocity and pressure where the rates there lead from a start.
 
     The stage solves, for the opening xv given,
@@ -265,17 +287,50 @@ def _load_stage(parameters, h):
         H*xv*r = A*v1 + Ct*PL1 + C*(PL1 - PL0)/h,   PL1 = s*(Ps - r*|r|),   s = sgn(xv).
     The load is linear, so that its flow is a straight line of the pressure, and what remains is a quadratic for the
     signed root r of the pressure drop. Its closed form never divides by xv: at xv = 0 (hydraulic lock) it gives Q = 0.
+
+    Dry friction R adds R*sgn(v1) to F. As v1 falls with F, the piston moves forward if it does so against F + R, backward
+    if it does so against F - R, and sticks otherwise: no chatter.
     """
-    area, mass, stiffness = parameters["piston_area"], parameters["mass"], parameters["stiffness"]
-    storage = parameters["hydraulic_capacitance"] / h
-    leakage = parameters["leakage_coefficient"]
+    area = parameters["piston_area"]
+    retraction_area = signal("retraction_area", area)
+    out = _load_equations(parameters, area, h, signal)
+    if retraction_area is area:
+        motion = out
+    else:
+        back = _load_equations(parameters, retraction_area, h, signal)
+
+        def motion(position, velocity, pressure, opening, supply, force):
+            forward, backward = (
+                part(position, velocity, pressure, opening, supply, force) for part in (out, back)
+            )
+            return tuple(jnp.where(opening < 0.0, b, f) for f, b in zip(forward, backward, strict=True))
+
+    def stage(position, velocity, pressure, opening, supply, force, friction):
+        if isinstance(friction, float) and friction == 0.0:
+            return motion(position, velocity, pressure, opening, supply, force)
+        forward = motion(position, velocity, pressure, opening, supply, force + friction)
+        backward = motion(position, velocity, pressure, opening, supply, force - friction)
+        stuck = position, jnp.zeros_like(velocity), 0.5 * (forward[2] + backward[2])
+        return tuple(
+            jnp.where(forward[1] > 0.0, f, jnp.where(backward[1] < 0.0, b, s))
+            for f, b, s in zip(forward, backward, stuck, strict=True)
+        )
+
+    return stage
+
+
+def _load_equations(parameters, area, h, signal):
+    """Return the stage without dry friction, for one piston area."""
+    mass, stiffness = parameters["mass"], parameters["stiffness"]
+    storage = signal("hydraulic_capacitance", parameters["hydraulic_capacitance"]) / h
+    leakage = signal("leakage_coefficient", parameters["leakage_coefficient"])
     # What does not change is divided by once, here: a reciprocal serves every step.
     flow_by_momentum = area / (mass + h * h * stiffness)
     pressure_by_flow = 1.0 / (h * area * flow_by_momentum + leakage + storage)
     half_slope_by_opening = 0.5 * parameters["flow_gain"] * pressure_by_flow
     per_area = 1.0 / area
 
-    def stage(position, velocity, pressure, opening, supply, force):
+    def motion(position, velocity, pressure, opening, supply, force):
         momentum = mass * velocity - h * (stiffness * position + force)
         flow_at_rest = flow_by_momentum * momentum - storage * pressure
         direction = jnp.where(opening < 0.0, -1.0, 1.0)
@@ -290,7 +345,7 @@ def _load_stage(parameters, h):
         velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) * per_area
         return position + h * velocity_end, velocity_end, pressure_end
 
-    return stage
+    return motion
 
 
 def _flow_force_stroke(parameters, opening, supply, load_pressure):

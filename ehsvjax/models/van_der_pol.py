@@ -31,7 +31,7 @@ def van_der_pol(alpha: float = 0.96, gamma: float = 1.23) -> Model:
         ),
         signals=(
             Signal("command", "input", ""),
-            Signal("displacement", "displacement", ""),
+            Signal("damping", "damping", ""),
             Signal("force", "force", ""),
             Signal("position", "sensor", ""),
         ),
@@ -53,9 +53,11 @@ def _derivative(parameters, state, inputs, signal):
     alpha, gamma = parameters["alpha"], parameters["gamma"]
     u = signal("command", inputs["command"])
     x2 = state["x2"]
-    x1 = signal("displacement", state["x1"], velocity=x2)
+    x1 = state["x1"]
+    # Where the damping changes its sign; the restoring force keeps x1 itself.
+    damping_position = signal("damping", x1)
     force = signal("force", 0.0, position=x1, velocity=x2)
-    return {"x1": alpha * x2, "x2": -x1 + gamma * (1.0 - x1**2) * x2 + u + force}
+    return {"x1": alpha * x2, "x2": -x1 + gamma * (1.0 - damping_position**2) * x2 + u + force}
 
 
 def _measure(parameters, state, inputs, signal):

@@ -1,0 +1,142 @@
+"""What a fit gets wrong, before any cause is named: when, at which frequencies, and against which quantity."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ehsvjax.diagnose.missing import Dependence, dependences
+from ehsvjax.diagnose.noise import lattice
+from ehsvjax.diagnose.selection import Selection
+from ehsvjax.precision.residual_noise import residual_noise
+
+_BINS = 12
+_WINDOWS = 20
+
+
+class Profile(NamedTuple):
+    """Mean residual by a quantity: `[bin]` its middle, the mean, and the mean's standard deviation under noise alone."""
+
+    middle: Float[np.ndarray, " bin"]
+    mean: Float[np.ndarray, " bin"]
+    deviation: Float[np.ndarray, " bin"]
+
+
+class Spectrum(NamedTuple):
+    """Power by frequency, Hz, of the residual and of the noise that the diagnosis counts on, unit^2/Hz."""
+
+    frequency: Float[np.ndarray, " frequency"]
+    residual: Float[np.ndarray, " frequency"]
+    noise: Float[np.ndarray, " frequency"]
+
+
+class OutputMisfit(NamedTuple):
+    """Of one output.
+
+    Attributes:
+        rmse: of the model refitted to the record, in its unit.
+        noise_floor: standard deviation of the noise, in its unit.
+        above_noise: share of the residual's sum of squares that is not noise.
+        residual: `[time]` measured minus simulated; NaN where nothing is measured.
+        in_time: `[window]` of equal length, the residual's rms over the noise's.
+        in_frequency: its spectrum and the noise's.
+        against: quantity -> mean residual by it.
+        whiteness: p-value of the residual being white (Ljung-Box); it cannot tell misfit from coloured noise.
+        coloured: whether the noise is counted as correlated.
+        outliers: `[time]` readings that stand alone and were left out.
+        lattice: step of the lattice on which the readings lie, in its unit; None where none shows.
+
+    """
+
+    rmse: float
+    noise_floor: float
+    above_noise: float
+    residual: Float[np.ndarray, " time"]
+    in_time: Float[np.ndarray, " window"]
+    in_frequency: Spectrum
+    against: dict[str, Profile]
+    whiteness: float
+    coloured: bool
+    outliers: Bool[np.ndarray, " time"]
+    lattice: float | None
+
+
+class Misfit(NamedTuple):
+    """What the nominal model gets wrong.
+
+    Attributes:
+        outputs: by name.
+        tests: whether the residual depends on something, the most significant first.
+        tests_after: the same of what the extended model leaves.
+
+    """
+
+    outputs: dict[str, OutputMisfit]
+    tests: tuple[Dependence, ...]
+    tests_after: tuple[Dependence, ...]
+
+
+def misfit_of(
+    selection: Selection, outliers: Bool[np.ndarray, "record time signal"], tests_after: tuple[Dependence, ...]
+) -> Misfit:
+    """Return what the nominal model gets wrong, judged by the noise that the whole diagnosis counts on."""
+    bench = selection.bench
+    samples = bench.problem.samples
+    tests = tests_after
+    if selection.included:
+        tests = dependences(bench, selection.nominal, selection.white, selection.seen)
+    outputs = {}
+    for i, name in enumerate(bench.problem.observed):
+        measured = samples.measured[0, :, i]
+        residual = np.where(measured, selection.nominal.residual[0, 0, :, i], np.nan)
+        noise = selection.white.noises[i]
+        found = residual_noise(
+            np.nan_to_num(residual)[None] / np.nanstd(residual), measured[None], "white"
+        )  # fmt: skip
+        square = float(np.nanmean(residual**2))
+        outputs[name] = OutputMisfit(
+            rmse=square**0.5,
+            noise_floor=noise.variance**0.5,
+            above_noise=float(np.clip(1.0 - noise.variance / square, 0.0, 1.0)),
+            residual=residual,
+            in_time=_in_time(residual) / noise.variance**0.5,
+            in_frequency=_in_frequency(residual, noise, float(samples.sample_period[0])),
+            against={q: _against(residual, series, noise) for q, series in selection.seen.items()},
+            whiteness=found.p_value,
+            coloured=bool(len(noise.coefficients)),
+            outliers=outliers[0, :, i],
+            lattice=lattice(samples.outputs[0, :, i][measured]),
+        )
+    return Misfit(outputs, tests, tests_after)
+
+
+def _in_time(residual) -> Float[np.ndarray, " window"]:
+    windows = np.array_split(residual, min(_WINDOWS, len(residual)))
+    return np.array([np.sqrt(np.nanmean(w**2)) if np.isfinite(w).any() else np.nan for w in windows])
+
+
+def _in_frequency(residual, noise, period) -> Spectrum:
+    from scipy.signal import welch
+
+    length = min(len(residual), 1024)
+    frequency, power = welch(np.nan_to_num(residual), 1.0 / period, nperseg=length)
+    angle = np.exp(-2j * np.pi * frequency * period)
+    response = 1.0 - sum(c * angle ** (k + 1) for k, c in enumerate(noise.coefficients))
+    noise_power = 2.0 * period * noise.innovation_variance / np.abs(response) ** 2
+    return Spectrum(frequency[1:], power[1:], np.broadcast_to(noise_power, frequency.shape)[1:])
+
+
+def _against(residual, series, noise) -> Profile:
+    edges = np.unique(np.quantile(series, np.linspace(0.0, 1.0, _BINS + 1)))
+    which = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, max(len(edges) - 2, 0))
+    kept = np.isfinite(residual)
+    middle, mean, deviation = [], [], []
+    for b in range(max(len(edges) - 1, 1)):
+        inside = kept & (which == b)
+        count = int(inside.sum())
+        if count:
+            middle.append(float(np.mean(series[inside])))
+            mean.append(float(np.mean(residual[inside])))
+            # Correlated samples tell less of a mean.
+            deviation.append(float(np.sqrt(noise.variance * min(noise.correlation_samples, count) / count)))
+    return Profile(np.array(middle), np.array(mean), np.array(deviation))

@@ -1,0 +1,288 @@
+"""What acts where, without a form assumed: missing terms at a signal as functions of what runs along the model.
+
+At a place (a force, an opening, a sensor) a term is added that depends on one quantity (velocity, position, spool, time,
+...) by a curve of straight pieces. The responses of the outputs to each piece are simulated. If the residual has
+nothing to do with any of them, it is innocent: what is left does not depend on the input. If it has, the curve itself
+is estimated, with its band.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.refits import Refits
+from ehsvjax.diagnose.screening import complement
+from ehsvjax.diagnose.workbench import Workbench
+
+_COARSE = 8
+_FINE = (8, 14, 24, 40)
+_DRAWS = 20_000
+_PROBE = 1e-3
+TIME = "time"
+
+
+class Dependence(NamedTuple):
+    """Whether the residual depends on a quantity, through a place.
+
+    Attributes:
+        place: signal at which a term is added; for a sensor the output itself.
+        quantity: that it depends on.
+        p_value: of no dependence, this test alone.
+        corrected: of all such tests together.
+        explained: noise variances of the residual's sum of squares that such a term takes, more than noise would give.
+
+    """
+
+    place: str
+    quantity: str
+    p_value: float
+    corrected: float
+    explained: float
+
+
+class MissingTerm(NamedTuple):
+    """A missing term, estimated without assuming its form.
+
+    Attributes:
+        place: signal at which it acts, and `unit` its unit.
+        quantity: that it depends on, and `quantity_unit`.
+        at: `[knot]` values of the quantity.
+        estimate: `[knot]` what is missing there, in the unit of the place.
+        deviation: `[knot]` standard deviation of the estimate.
+        series: `[time]` the term along the record.
+        relative: whether the estimate is a share of the value at the place.
+        explained: share of the residual's sum of squares above the noise that it takes.
+
+    """
+
+    place: str
+    unit: str
+    quantity: str
+    quantity_unit: str
+    at: Float[np.ndarray, " knot"]
+    estimate: Float[np.ndarray, " knot"]
+    deviation: Float[np.ndarray, " knot"]
+    series: Float[np.ndarray, " time"]
+    relative: bool
+    explained: float
+
+
+class _Curve(NamedTuple):
+    """Straight pieces along one quantity at one place: `[piece, time]`, and the knots."""
+
+    place: str
+    quantity: str
+    knots: Float[np.ndarray, " knot"]
+    pieces: Float[np.ndarray, "piece time"]
+    relative: bool
+
+
+def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
+    """Return what runs along the nominal model and varies, each once: the inputs, outputs, signals, their contexts."""
+    record_time = np.arange(bench.problem.samples.inputs.shape[1]) * float(bench.problem.samples.sample_period[0])
+    inputs = bench.problem.samples.inputs[0]
+    found = {TIME: record_time}
+    found |= {name: inputs[:, k] for k, name in enumerate(bench.fit.model.inputs)}
+    # The outputs first: of two names for one motion that of the sensor is the one that people know.
+    found |= {name: bench.internal.values[name] for name in bench.problem.observed if name in bench.internal.values}
+    found |= dict(bench.internal.values)
+    for context in bench.internal.contexts.values():
+        for name, series in context.items():
+            found.setdefault(name, series)
+    kept: dict[str, np.ndarray] = {}
+    for name, series in found.items():
+        if not np.all(np.isfinite(series)) or np.ptp(series) <= 1e-9 * (np.max(np.abs(series)) + 1e-300):
+            continue
+        alike = (abs(np.corrcoef(series, other)[0, 1]) > 0.9999 for other in kept.values())
+        if not any(alike):
+            kept[name] = series
+    return kept
+
+
+def curve_responses(
+    bench: Workbench, current: Refits, seen: Mapping[str, Float[np.ndarray, " time"]]
+) -> Float[np.ndarray, "response record time signal"]:
+    """Return what each piece of every curve does to the outputs from the point of a refit."""
+    curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
+    return _responses(bench, current.points[0], curves)
+
+
+def strongest_dependence(
+    bench: Workbench, current: Refits, white: Whitening, seen: Mapping[str, Float[np.ndarray, " time"]]
+) -> float:
+    """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
+    return max(d.explained for d in dependences(bench, current, white, seen))
+
+
+def dependences(
+    bench: Workbench, final: Refits, white: Whitening, seen: Mapping[str, Float[np.ndarray, " time"]]
+) -> tuple[Dependence, ...]:
+    """Test whether a residual still depends on anything, the most significant first.
+
+    Args:
+        bench: the trials' workbench.
+        final: the refit whose residual is judged.
+        white: of its noise.
+        seen: the quantities.
+
+    """
+    curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
+    known, r = _unexplained(final, white)
+    changes = white(_responses(bench, final.points[0], curves))
+    rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
+    bases = [_outside(known, part) for part in rows]
+    statistics = [float(np.sum((q.T @ r) ** 2)) for q in bases]
+    along = np.concatenate(bases, axis=1)
+    drawn = np.random.default_rng(1).standard_normal((_DRAWS, along.shape[1])) @ _root(along)
+    p_values, null, column = [], np.ones(_DRAWS), 0
+    for q, statistic in zip(bases, statistics, strict=True):
+        part = drawn[:, column : column + q.shape[1]]
+        column += q.shape[1]
+        p_values.append(float(stats.chi2.sf(statistic, q.shape[1])))
+        null = np.minimum(null, stats.chi2.sf(np.sum(part**2, axis=1), q.shape[1]))
+    null.sort()
+    found = []
+    for curve, q, statistic, p in zip(curves, bases, statistics, p_values, strict=True):
+        corrected = np.searchsorted(null, p, side="right") / _DRAWS
+        if corrected < 20 / _DRAWS:
+            corrected = min(20 / _DRAWS, len(curves) * p)
+        found.append(Dependence(curve.place, curve.quantity, p, float(corrected), statistic - q.shape[1]))
+    return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
+
+
+def missing_term(
+    bench: Workbench,
+    final: Refits,
+    white: Whitening,
+    seen: Mapping[str, Float[np.ndarray, " time"]],
+    suspects: Sequence[Dependence],
+) -> MissingTerm:
+    """Estimate the term that takes most of what is left, with as many pieces as it deserves (Bayes criterion)."""
+    known, r = _unexplained(final, white)
+    best = None
+    for suspect in suspects:
+        for pieces in _FINE:
+            curve = next(c for c in _curves(bench, suspect.place, seen, pieces) if c.quantity == suspect.quantity)
+            responses = white(_responses(bench, final.points[0], [curve]))
+            outside = responses - (responses @ known) @ known.T
+            coefficients, covariance = _least_squares(outside, r)
+            left = float(np.sum((r - coefficients @ outside) ** 2))
+            criterion = left + len(coefficients) * np.log(len(r))
+            if best is None or criterion < best[0]:
+                best = (criterion, left, curve, coefficients, covariance)
+    assert best is not None
+    _, left, curve, coefficients, covariance = best
+    probe = _probe(bench, curve.place)
+    estimate, deviation = coefficients * probe, np.sqrt(np.maximum(np.diag(covariance), 0.0)) * probe
+    excess = float(r @ r) - (len(r) - known.shape[1])
+    taken = float(r @ r) - left - len(coefficients)
+    return MissingTerm(
+        place=curve.place,
+        unit="" if curve.relative else _unit(bench, curve.place),
+        quantity=curve.quantity,
+        quantity_unit=_quantity_unit(bench, curve.quantity),
+        at=curve.knots,
+        estimate=estimate,
+        deviation=deviation,
+        series=estimate @ curve.pieces,
+        relative=curve.relative,
+        explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
+    )
+
+
+def _places(bench: Workbench) -> tuple[str, ...]:
+    return (*bench.places, *bench.problem.observed)
+
+
+def _curves(bench, place, seen, pieces) -> list[_Curve]:
+    """Return curves of straight pieces along every quantity at a place."""
+    kinds = {s.name: s.kind for s in bench.fit.model.signals}
+    relative = kinds[place] == "opening"
+    found = []
+    for name, series in seen.items():
+        knots = np.unique(np.quantile(series, np.linspace(0.0, 1.0, pieces)))
+        if len(knots) < 4:
+            # Held levels, of which most samples have the same: spread over the range.
+            knots = np.linspace(series.min(), series.max(), pieces)
+        hats = np.stack([np.interp(series, knots, np.eye(len(knots))[k]) for k in range(len(knots))])
+        found.append(_Curve(place, name, knots, hats, relative))
+    return found
+
+
+def _probe(bench: Workbench, place: str) -> float:
+    """Return the size of a small disturbance at a place: a share of its value where it has one."""
+    kinds = {s.name: s.kind for s in bench.fit.model.signals}
+    if kinds[place] == "opening" or place in bench.problem.observed:
+        return _PROBE
+    largest = float(np.max(np.abs(bench.internal.values[place])))
+    return _PROBE * largest if largest > 0 else _PROBE
+
+
+def _responses(bench: Workbench, point, curves: Sequence[_Curve]) -> Float[np.ndarray, "piece record time signal"]:
+    """Return what each piece of curves, as large as a probe, does to the outputs."""
+    samples = bench.problem.samples
+    inside = [c for c in curves if c.place in bench.places]
+    added = np.zeros((1 + sum(len(c.pieces) for c in inside), *samples.outputs.shape[:2], len(bench.places)))
+    row = 1
+    for curve in inside:
+        size = bench.internal.values[curve.place] if curve.relative else 1.0
+        place = bench.places.index(curve.place)
+        added[row : row + len(curve.pieces), 0, :, place] = _probe(bench, curve.place) * curve.pieces * size
+        row += len(curve.pieces)
+    outputs = bench.simulated(np.repeat(point[None], len(added), axis=0), added) if inside else None
+    changes, row = [], 1
+    for curve in curves:
+        if curve.place in bench.places:
+            assert outputs is not None
+            changes.append(outputs[row : row + len(curve.pieces)] - outputs[0])
+            row += len(curve.pieces)
+        else:
+            sensed = np.zeros((len(curve.pieces), *samples.outputs.shape))
+            sensed[:, 0, :, bench.problem.observed.index(curve.place)] = _PROBE * curve.pieces
+            changes.append(sensed)
+    return np.concatenate(changes)
+
+
+def _unexplained(final: Refits, white: Whitening):
+    known = complement(white(final.slopes[0]))
+    r = white(final.residual[0])
+    return known, r - known @ (known.T @ r)
+
+
+def _outside(known, responses) -> Float[np.ndarray, "sample direction"]:
+    """Return an orthonormal basis of the responses outside what the unknowns can do."""
+    norms = np.linalg.norm(responses, axis=1)
+    rows = responses[norms > 0] / norms[norms > 0, None]
+    rows = rows - (rows @ known) @ known.T
+    vectors, values, _ = np.linalg.svd(rows.T, full_matrices=False)
+    return vectors[:, values > 1e-4 * max(values[0], 1e-300)] if len(values) else np.zeros((rows.shape[1], 0))
+
+
+def _root(along) -> Float[np.ndarray, "direction direction"]:
+    values, vectors = np.linalg.eigh(along.T @ along)
+    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+
+
+def _least_squares(rows, r):
+    """Return coefficients and their covariance; what the record does not show at all is left at zero."""
+    norms = np.linalg.norm(rows, axis=1)
+    scale = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
+    vectors, values, others = np.linalg.svd((rows * scale[:, None]).T, full_matrices=False)
+    inverse = np.where(values > 1e-4 * values[0], 1.0 / np.maximum(values, 1e-300), 0.0)
+    root = others.T * inverse
+    return scale * (root @ (vectors.T @ r)), (root @ root.T) * np.outer(scale, scale)
+
+
+def _unit(bench: Workbench, place: str) -> str:
+    return bench.fit.model.unit(place)
+
+
+def _quantity_unit(bench: Workbench, name: str) -> str:
+    if name == TIME:
+        return "s"
+    units = {s.name: s.unit for s in bench.fit.model.signals}
+    return units.get(name, {"velocity": "m/s", "flow": "m^3/s", "load_force": "N"}.get(name, ""))

@@ -1,0 +1,186 @@
+"""The noise of a record that a model does not explain yet: spikes, lattices, and correlated noise told from misfit.
+
+A residual is noise and misfit together. What candidate causes could have done lies in the space of their responses, so
+that noise is judged by what is left of the residual outside that space: a model's misfit is then not taken for coloured
+noise, nor coloured noise for a misfit.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ehsvjax.precision.residual_noise import (
+    SUSPICION,
+    ResidualNoise,
+    absorbed_by_the_fit,
+    meat,
+    residual_noise,
+)
+
+# Directions of the candidates' responses below this share of the largest are counted as noise.
+_NEGLIGIBLE = 1e-3
+# A sample stands alone if it differs from both its neighbours by this many deviations of a difference.
+_SPIKE = 4.0
+
+
+class Whitening(NamedTuple):
+    """Makes noise white and of variance one: the innovations of an autoregression of each output.
+
+    Attributes:
+        noises: of each output, in its unit.
+        used: `[record, time, signal]` samples whose innovation can be computed.
+
+    """
+
+    noises: tuple[ResidualNoise, ...]
+    used: Bool[np.ndarray, "record time signal"]
+
+    def __call__(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return the whitened samples that can be used."""
+        parts = []
+        for i, noise in enumerate(self.noises):
+            whitened = series[..., i].astype(float, copy=True)
+            for lag, coefficient in enumerate(noise.coefficients, start=1):
+                whitened[..., lag:] -= coefficient * series[..., :-lag, i]
+            parts.append(whitened[..., self.used[..., i]] / np.sqrt(noise.innovation_variance))
+        return np.concatenate(parts, axis=-1)
+
+    @property
+    def coloured(self) -> bool:
+        """Whether any output's noise is correlated."""
+        return any(len(noise.coefficients) for noise in self.noises)
+
+
+def whitening(noises: Sequence[ResidualNoise], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
+    """Return the whitening of noises for what is measured: a sample needs those before it."""
+    used = measured.copy()
+    for i, noise in enumerate(noises):
+        order = len(noise.coefficients)
+        for lag in range(1, order + 1):
+            used[:, lag:, i] &= measured[:, :-lag, i]
+        used[:, :order, i] = False
+    return Whitening(tuple(noises), used)
+
+
+def noise_outside(
+    residual: Float[np.ndarray, "record time signal"],
+    measured: Bool[np.ndarray, "record time signal"],
+    responses: Float[np.ndarray, "response record time signal"],
+    directions: int | None = None,
+) -> Whitening:
+    """Return the noise that is left of a residual outside the space of some responses.
+
+    Args:
+        residual: in the outputs' units; anything where nothing is measured.
+        measured: where there is a sample.
+        responses: of all that may have acted: the model's sensitivities, the candidates' responses.
+        directions: of that space at most, the strongest; None for all that are not negligible.
+
+    """
+    deviation = np.array([_deviation(residual[..., i][measured[..., i]]) for i in range(residual.shape[-1])])
+    standardised = np.where(measured, residual, 0.0) / deviation
+    basis = _basis(np.where(measured, responses, 0.0) / deviation, directions)
+    left = standardised - _combined(basis, standardised)
+    noises: list[ResidualNoise] | None = None
+    colour = "auto"
+    count = int(measured.sum())
+    # What the projection took of the noise depends on the noise: three rounds settle it.
+    for _ in range(4):
+        found = []
+        inside = None if noises is None else sum(
+            meat(basis[..., i], noise) for i, noise in enumerate(noises)
+        )  # fmt: skip
+        for i in range(residual.shape[-1]):
+            absorbed = None
+            if noises is not None:
+                absorbed = absorbed_by_the_fit(
+                    basis[..., i], measured[..., i], noises[i], np.eye(basis.shape[-2]), inside
+                )
+            noise = residual_noise(left[..., i], measured[..., i], colour, absorbed)
+            if absorbed is None and count > basis.shape[-2]:
+                scale = count / (count - basis.shape[-2])
+                noise = noise._replace(
+                    variance=noise.variance * scale, innovation_variance=noise.innovation_variance * scale
+                )
+            found.append(noise)
+        noises = found
+        if not any(len(noise.coefficients) for noise in noises):
+            break
+    assert noises is not None
+    in_units = [
+        n._replace(variance=n.variance * d**2, innovation_variance=n.innovation_variance * d**2)
+        for n, d in zip(noises, deviation, strict=True)
+    ]
+    return whitening(in_units, measured)
+
+
+def _basis(responses, directions) -> Float[np.ndarray, "record time direction signal"]:
+    """Return orthonormal directions of the responses' space."""
+    shape = responses.shape[1:]
+    flat = responses.reshape(len(responses), -1)
+    norms = np.linalg.norm(flat, axis=1)
+    flat = flat[norms > 0] / norms[norms > 0, None]
+    values, vectors = np.linalg.svd(flat, full_matrices=False)[1:]
+    kept = vectors[values > _NEGLIGIBLE * values[0]][:directions]
+    return np.moveaxis(kept.reshape(-1, *shape), 0, 2)
+
+
+def _combined(basis, residual):
+    coefficients = np.einsum("rtds,rts->d", basis, residual)
+    return np.einsum("rtds,d->rts", basis, coefficients)
+
+
+def _deviation(values) -> float:
+    found = float(np.std(values)) if len(values) else 1.0
+    return found if found > 0 else 1.0
+
+
+def spikes(
+    residual: Float[np.ndarray, "record time signal"],
+    measured: Bool[np.ndarray, "record time signal"],
+    outputs: Float[np.ndarray, "record time signal"],
+) -> Bool[np.ndarray, "record time signal"]:
+    """Return samples that stand alone, far from both neighbours and on one side of them, residual and reading alike.
+
+    A misfit of a jump stands alone in the residual, but not in the reading: it is no spike.
+    """
+    found = np.zeros_like(measured)
+    for i in range(residual.shape[-1]):
+        both = np.ones(measured.shape[:2], bool)
+        differences = np.diff(residual[..., i], axis=1)[measured[:, 1:, i] & measured[:, :-1, i]]
+        spread = 1.4826 * np.median(np.abs(differences - np.median(differences))) if len(differences) else 0.0
+        if spread == 0.0:
+            continue
+        for series in (residual[..., i], outputs[..., i]):
+            for reach in (1, 2):
+                before, after = np.full(series.shape, np.nan), np.full(series.shape, np.nan)
+                before[:, reach:] = series[:, reach:] - series[:, :-reach]
+                after[:, :-reach] = series[:, :-reach] - series[:, reach:]
+                alone = (before * after > 0) & (np.fmin(np.abs(before), np.abs(after)) > _SPIKE * spread)
+                both &= alone | (np.isnan(before) | np.isnan(after))
+        found[..., i] = both & measured[..., i]
+        found[:, :1, i] = found[:, -1:, i] = False
+    return found
+
+
+def lattice(values: Float[np.ndarray, " time"]) -> float | None:
+    """Return the step of the lattice on which readings lie, in their unit; None if they lie on none that shows.
+
+    Every difference of two readings is a multiple of the step, to a thousandth of it.
+    """
+    levels = np.unique(values[np.isfinite(values)])
+    if len(levels) < 3 or len(levels) > 0.5 * len(values):
+        return None
+    gaps = np.diff(levels)
+    step = float(np.min(gaps))
+    if step <= 1e-9 * float(np.ptp(levels)):
+        return None
+    multiples = gaps / step
+    step = float(np.sum(gaps) / np.sum(np.round(multiples)))
+    off = np.abs(gaps / step - np.round(gaps / step))
+    return step if np.max(off) < 1e-3 * np.max(multiples) + 1e-3 else None
+
+
+__all__ = ["SUSPICION", "Whitening", "lattice", "noise_outside", "spikes", "whitening"]

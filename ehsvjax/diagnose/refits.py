@@ -1,0 +1,155 @@
+"""Refits: from many starts at once, each with unknowns of its own, by Levenberg-Marquardt on whitened residuals."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.effects.effect import UNLIMITED
+
+_ITERATIONS = 30
+# A start is given up if so many steps like the next would not bring it to the best, after a few.
+_HOPELESS = 5.0
+_PATIENCE = 4
+_STEEPEST = 1e100
+
+
+class Refits(NamedTuple):
+    """Where each start has led.
+
+    Attributes:
+        points: `[individual, parameter]` the best point of each.
+        cost: the sum of squares of its whitened residuals.
+        residual: measured minus simulated there, in the outputs' units.
+        slopes: derivatives of the outputs by the chosen unknowns there; zero along padding.
+        chosen: `[individual, direction]` the unknowns' columns; -1 is padding.
+        converged: whether another step would gain less than a hundredth of the noise's variance.
+
+    """
+
+    points: Float[np.ndarray, "individual parameter"]
+    cost: Float[np.ndarray, " individual"]
+    residual: Float[np.ndarray, "individual record time signal"]
+    slopes: Float[np.ndarray, "individual direction record time signal"]
+    chosen: Int[np.ndarray, "individual direction"]
+    converged: Bool[np.ndarray, " individual"]
+
+    def best(self, i: int) -> "Refits":
+        """Return the refit of one start."""
+        return Refits(*(field[i : i + 1] for field in self))
+
+
+def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
+    """Return lists of columns side by side, filled up with -1."""
+    return np.array([list(c) + [-1] * (width - len(c)) for c in columns])
+
+
+def bounds_of(bench: Workbench) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " parameter"]]:
+    """Return the least and the largest coordinate of every unknown."""
+    lower, upper = np.zeros(len(bench.nominal)), np.ones(len(bench.nominal))
+    for candidate in bench.candidates:
+        scales = bench.scales[candidate.name]
+        for number in candidate.effect.parameters:
+            j = bench.column[candidate.parameter(number.name)]
+            unit = bench.problem.coordinates.upper[j]
+            low, high = number.lower(scales), number.upper(scales)
+            lower[j] = -np.inf if low <= -UNLIMITED else low / unit
+            upper[j] = np.inf if high >= UNLIMITED else high / unit
+    return lower, upper
+
+
+def refit(
+    bench: Workbench,
+    starts: Float[np.ndarray, "individual parameter"],
+    chosen: Int[np.ndarray, "individual direction"],
+    white: Whitening,
+    iterations: int = _ITERATIONS,
+) -> Refits:
+    """Refit the chosen unknowns of every start.
+
+    Damping is relative to the diagonal and grows by 2, 4, 8, ... for steps in a row that did not lower the cost (Nielsen
+    1999); an unknown at a bound that the gradient pushes outwards is held there.
+
+    Args:
+        bench: the trials' workbench.
+        starts: points.
+        chosen: columns of the unknowns of each start; -1 is padding.
+        white: of the noise.
+        iterations: at most this many steps.
+
+    """
+    lower, upper = bounds_of(bench)
+    measured = bench.problem.samples.outputs
+    count, width = chosen.shape
+    points = starts.copy()
+    kept: list = [None] * count
+    damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
+    cost = np.full(count, np.inf)
+    converged = np.zeros(count, bool)
+    running = np.ones(count, bool)
+    for i in range(count):
+        own = chosen[i][chosen[i] >= 0]
+        points[i, own] = np.clip(points[i, own], lower[own], upper[own])
+    trial = points.copy()
+    for iteration in range(iterations):
+        at = np.flatnonzero(running)
+        if not len(at):
+            break
+        y, slopes = bench.linearised(trial[at], chosen[at])
+        residual = measured[None] - y
+        whitened = white(residual)
+        columns = white(slopes)
+        for row, i in enumerate(at):
+            value = float(whitened[row] @ whitened[row])
+            jacobian = columns[:, row]
+            # A NaN is no improvement, nor is a place that is so steep that nothing can be told from there.
+            if value < cost[i] and np.max(np.abs(jacobian), initial=0.0) < _STEEPEST:
+                points[i], cost[i] = trial[i], value
+                kept[i] = (residual[row], slopes[:, row], jacobian @ whitened[row], jacobian @ jacobian.T)
+                damping[i], growth[i] = 0.1 * damping[i], 2.0
+            else:
+                damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
+            if kept[i] is None:
+                running[i] = False
+                continue
+            step, gain = _step(points[i], chosen[i], kept[i][2], kept[i][3], damping[i], lower, upper)
+            if gain < 0.01 * max(cost[i] / whitened.shape[1], 1e-300):
+                converged[i] = True
+                running[i] = False
+            elif damping[i] > 1e12 or (iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
+                running[i] = False
+            trial[i] = points[i] + step
+    shape = bench.problem.samples.outputs.shape
+    nothing = (np.full(shape, np.nan), np.zeros((width, *shape)))
+    return Refits(
+        points,
+        cost,
+        np.stack([k[0] if k else nothing[0] for k in kept]),
+        np.stack([k[1] if k else nothing[1] for k in kept]),
+        chosen,
+        converged,
+    )
+
+
+def _step(point, chosen, gradient, information, damping, lower, upper):
+    """Return the step of one point in all its coordinates, and what it should gain to first order."""
+    step = np.zeros(len(point))
+    columns = np.maximum(chosen, 0)
+    pushed_out = ((point[columns] >= upper[columns]) & (gradient > 0)) | (
+        (point[columns] <= lower[columns]) & (gradient < 0)
+    )
+    free = (chosen >= 0) & (np.diag(information) > 0) & ~pushed_out
+    if not free.any():
+        return step, 0.0
+    scale = 1.0 / np.sqrt(np.diag(information)[free])
+    scaled = information[np.ix_(free, free)] * scale[:, None] * scale
+    values, vectors = np.linalg.eigh(scaled)
+    fixed = values > len(values) * np.finfo(float).eps * values[-1]
+    inverse = np.where(fixed, 1.0 / (np.where(fixed, values, 1.0) + damping), 0.0)
+    moved = scale * (vectors @ (inverse * (vectors.T @ (scale * gradient[free]))))
+    own = chosen[free]
+    target = np.clip(point[own] + moved, lower[own], upper[own])
+    step[own] = target - point[own]
+    return step, float(gradient[free] @ step[own])

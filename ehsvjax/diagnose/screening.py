@@ -1,0 +1,270 @@
+"""Which of all candidates could explain what is left: a score for each, and how often noise alone would do as well.
+
+For each candidate, finite steps of its numbers are simulated, for a derivative would not see a kink or a play. What
+refitting the unknowns could do instead is projected out of the response; along what remains the whitened residual is
+a standard normal number if there is noise alone (Lagrange multiplier test; one-sided where the effect is). The p-value
+counts the whole search: it is how often the largest of all candidates' scores is as large under noise (Monte Carlo of
+the correlated normal numbers), with the frequencies that were searched.
+"""
+
+import itertools
+from collections.abc import Collection, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.refits import Refits, bounds_of
+from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.effects.effect import Candidate
+
+_DRAWS = 20_000
+# Share of a response that must be left after the refit of the unknowns: below is rounding.
+_SURVIVES = 1e-5
+
+
+class Trial(NamedTuple):
+    """One step of a candidate: for a harmonic effect the two steps of one frequency.
+
+    Attributes:
+        candidate: position in the workbench.
+        points: `[step, parameter]` where each step leads.
+        one_sided: whether the effect can only act in this direction.
+        proportional: whether half the step would do half as much.
+
+    """
+
+    candidate: int
+    points: Float[np.ndarray, "step parameter"]
+    one_sided: bool
+    proportional: bool
+
+
+class Screened(NamedTuple):
+    """What one candidate could do, at its best trial.
+
+    Attributes:
+        candidate: position in the workbench.
+        score: of the residual along the response, in deviations; signed for a single step.
+        p_value: of that score alone.
+        corrected: of the whole search.
+        start: `[parameter]` the point from which to refit it.
+        response: `[sample]` what the refit of the unknowns cannot do instead, whitened, of unit length.
+        strength: deviations of the noise by which the unit of `amount` moves the record.
+        amount: of the step, SI, in the first of the effect's numbers.
+        surviving: share of the response that the refit of the unknowns leaves.
+
+    """
+
+    candidate: int
+    score: float
+    p_value: float
+    corrected: float
+    start: Float[np.ndarray, " parameter"]
+    response: Float[np.ndarray, " sample"]
+    strength: float
+    amount: float
+    surviving: float
+
+
+class Screening(NamedTuple):
+    """All candidates on one residual.
+
+    Attributes:
+        ranked: those whose response survives, the most significant first.
+        unseen: positions of candidates whose response does not survive a refit of the unknowns, or is none.
+        responses: `[response, record, time, signal]` of all trials, in the outputs' units.
+        threshold: score of a single two-sided candidate that the search exceeds in one of a thousand records of noise.
+
+    """
+
+    ranked: tuple[Screened, ...]
+    unseen: tuple[int, ...]
+    responses: Float[np.ndarray, "response record time signal"]
+    threshold: float
+
+
+class Responses(NamedTuple):
+    """What every trial does to the outputs: made once at a point, judged under any noise."""
+
+    trials: tuple[Trial, ...]
+    changes: Float[np.ndarray, "response record time signal"]
+
+
+def responses_at(bench: Workbench, current: Refits, excluded: Collection[int]) -> Responses:
+    """Simulate the trials of every candidate but the excluded ones from the point of a refit.
+
+    Args:
+        bench: the trials' workbench.
+        current: one refit.
+        excluded: positions of candidates that it includes already.
+
+    """
+    point = current.points[0]
+    here = bench.problem.samples.outputs - current.residual[0]
+    trials = [
+        trial for i, c in enumerate(bench.candidates) if i not in excluded for trial in _trials(bench, i, c, point)
+    ]
+    points = np.concatenate([t.points for t in trials]) if trials else np.zeros((0, len(point)))
+    changes = bench.simulated(points) - here if len(points) else np.zeros((0, *here.shape))
+    changes = np.where(np.isfinite(changes).all(axis=(1, 2, 3), keepdims=True), changes, 0.0)
+    return Responses(tuple(trials), changes)
+
+
+def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> list[Trial]:
+    """Return the steps of a candidate: of each amplitude, at each combination of its shapes."""
+    scales = bench.scales[candidate.name]
+    lower, _ = bounds_of(bench)
+    numbers = candidate.effect.parameters
+    amplitudes = [n for n in numbers if n.absent is not None]
+    shapes = [n for n in numbers if n.absent is None]
+    found = []
+    for values in itertools.product(*(n.tries(scales) for n in shapes)):
+        at = point.copy()
+        for number, value in zip(shapes, values, strict=True):
+            j = bench.column[candidate.parameter(number.name)]
+            at[j] = value / bench.problem.coordinates.upper[j]
+        for steps in itertools.zip_longest(*(n.tries(scales) for n in amplitudes)):
+            moved = np.repeat(at[None], len(amplitudes), axis=0)
+            for row, (number, value) in enumerate(zip(amplitudes, steps, strict=True)):
+                j = bench.column[candidate.parameter(number.name)]
+                moved[row, j] = value / bench.problem.coordinates.upper[j]
+            first = bench.column[candidate.parameter(amplitudes[0].name)]
+            tried = amplitudes[0].tries(scales)
+            one_sided = len(amplitudes) == 1 and (amplitudes[0].absent != 0.0 or lower[first] >= 0.0)
+            proportional = len(tried) == 1
+            if amplitudes[0].absent == 1.0:
+                one_sided = False
+            found.append(Trial(position, moved, one_sided, proportional))
+    return found
+
+
+def complement(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample direction"]:
+    """Return an orthonormal basis of what the unknowns can do."""
+    norms = np.linalg.norm(slopes, axis=1)
+    kept = slopes[norms > 0] / norms[norms > 0, None]
+    if not len(kept):
+        return np.zeros((slopes.shape[1], 0))
+    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
+    return vectors[:, values > 1e-9 * values[0]]
+
+
+def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening, harmonics: int) -> Screening:
+    """Score every trial under a noise.
+
+    Args:
+        bench: the trials' workbench.
+        current: the refit to which an effect would be added.
+        tried: the responses at its point.
+        white: of the noise.
+        harmonics: how many frequencies were searched for the few that were tried.
+
+    """
+    r = white(current.residual[0])
+    known = complement(white(current.slopes[0]))
+    g = white(tried.changes)
+    whole = np.linalg.norm(g, axis=1)
+    g = g - (g @ known) @ known.T
+    r = r - known @ (known.T @ r)
+    left = np.linalg.norm(g, axis=1)
+    survives = left > _SURVIVES * np.maximum(whole, 1e-300)
+    bases, row = [], 0
+    for trial in tried.trials:
+        rows = np.arange(row, row + len(trial.points))
+        row += len(trial.points)
+        ok = rows[survives[rows]]
+        bases.append((trial, rows, np.linalg.qr(g[ok].T)[0] if len(ok) else None))
+    judged = [(t, rows, q) for t, rows, q in bases if q is not None]
+    if not judged:
+        every = tuple(sorted({t.candidate for t in tried.trials}))
+        return Screening((), every, tried.changes, 0.0)
+    along = np.concatenate([q for _, _, q in judged], axis=1)
+    signs = np.concatenate([np.sign(q.T @ g[rows].sum(axis=0)) if q.shape[1] == 1 else np.ones(q.shape[1])
+                            for _, rows, q in judged])  # fmt: skip
+    along = along * signs
+    u = along.T @ r
+    # Noise alone, along all responses at once.
+    spread = np.linalg.qr(along, mode="r")
+    drawn = np.random.default_rng(0).standard_normal((_DRAWS, len(spread))) @ spread
+    p_values, null, column = [], np.ones(_DRAWS), 0
+    for trial, _, q in judged:
+        part = slice(column, column + q.shape[1])
+        column += q.shape[1]
+        p_values.append(_p_value(u[part][None], trial)[0])
+        if q.shape[1] == 1:
+            null = np.minimum(null, _p_value(drawn[:, part], trial))
+    null.sort()
+    best: dict[int, Screened] = {}
+    column = 0
+    for (trial, rows, q), p in zip(judged, p_values, strict=True):
+        part = slice(column, column + q.shape[1])
+        column += q.shape[1]
+        harmonic = q.shape[1] > 1
+        if harmonic:
+            corrected = -np.expm1(harmonics * np.log1p(-min(p, 1.0 - 1e-16)))
+        else:
+            # Beyond what was drawn, by Bonferroni's bound.
+            corrected = np.searchsorted(null, p, side="right") / _DRAWS
+            if corrected < 20 / _DRAWS:
+                corrected = min(len(judged) * p, 20 / _DRAWS)
+        start, amount, strength = _start(bench, trial, g[rows], r, left[rows])
+        score = float(u[part][0]) if not harmonic else float(np.linalg.norm(u[part]))
+        found = Screened(
+            candidate=trial.candidate,
+            score=score,
+            p_value=float(p),
+            corrected=float(min(1.0, corrected)),
+            start=start,
+            response=along[:, part.start] if not harmonic else q @ (q.T @ r) / max(np.linalg.norm(q.T @ r), 1e-300),
+            strength=strength,
+            amount=amount,
+            surviving=float(left[rows].max() / whole[rows].max()),
+        )
+        # Among trials of one candidate the one that explains most.
+        before = best.get(trial.candidate)
+        if before is not None:
+            # Of all that was tried, the step that shows best tells what could have been seen.
+            strongest = float(np.nanmax([found.strength, before.strength, -np.inf]))
+            found, before = (s._replace(strength=strongest) for s in (found, before))
+            best[trial.candidate] = before
+        if before is None or (found.p_value, -abs(found.score)) < (before.p_value, -abs(before.score)):
+            best[trial.candidate] = found
+    ranked = tuple(sorted(best.values(), key=lambda s: (s.p_value, -abs(s.score))))
+    unseen = tuple(sorted({t.candidate for t in tried.trials} - set(best)))
+    threshold = float(stats.norm.isf(0.5 * max(null[int(1e-3 * _DRAWS)], 1e-12)))
+    return Screening(ranked, unseen, tried.changes, threshold)
+
+
+def _p_value(u: Float[np.ndarray, "draw step"], trial: Trial) -> Float[np.ndarray, " draw"]:
+    if u.shape[1] > 1:
+        return stats.chi2.sf(np.sum(u**2, axis=1), u.shape[1])
+    if trial.one_sided:
+        return stats.norm.sf(u[:, 0])
+    return 2.0 * stats.norm.sf(np.abs(u[:, 0]))
+
+
+def _start(bench: Workbench, trial: Trial, g, r, left):
+    """Return the point from which to refit, the first amplitude there, SI, and the strength of one unit of it."""
+    candidate = bench.candidates[trial.candidate]
+    amplitudes = [n for n in candidate.effect.parameters if n.absent is not None]
+    columns = [bench.column[candidate.parameter(n.name)] for n in amplitudes]
+    start = trial.points[0].copy()
+    unit = bench.problem.coordinates.upper
+    absent = np.array([n.absent for n in amplitudes]) / unit[columns]
+    steps = np.array([trial.points[row, j] for row, j in enumerate(columns)]) - absent
+    if trial.proportional:
+        factors = np.linalg.lstsq(g.T, r, rcond=None)[0]
+        lower, upper = bounds_of(bench)
+        for j, step, nothing, factor in zip(columns, steps, absent, factors, strict=True):
+            start[j] = np.clip(nothing + factor * step, lower[j], upper[j])
+    size = abs(steps[0] * unit[columns[0]]) if abs(steps[0]) < 1e29 else float("nan")
+    amount = start[columns[0]] * unit[columns[0]]
+    strength = float(left[0] / size) if size and np.isfinite(size) else float("nan")
+    return start, float(amount), strength
+
+
+def names_of(bench: Workbench, positions: Sequence[int]) -> tuple[str, ...]:
+    """Return the names under which candidates are reported, forms of one effect once."""
+    return tuple(dict.fromkeys(bench.candidates[i].name for i in positions))

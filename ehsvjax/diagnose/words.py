@@ -1,0 +1,135 @@
+"""A diagnosis in sentences."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ehsvjax.diagnose.diagnosis import Diagnosis
+
+# Excluded effects that are printed.
+_NAMED = 10
+
+
+def sentences(diagnosis: "Diagnosis") -> list[str]:
+    """Return the diagnosis as lines of text, what matters first."""
+    lines = [f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {verdict(diagnosis)}", ""]
+    lines += [f"  {line}" for line in (*misfit_lines(diagnosis), *cause_lines(diagnosis), *gain_lines(diagnosis))]
+    lines += [f"  {line}" for line in next_lines(diagnosis)]
+    return lines
+
+
+def verdict(diagnosis: "Diagnosis") -> str:
+    """Return the verdict in a sentence."""
+    causes = " and ".join(diagnosis.causes)
+    left = "" if diagnosis.innocent else " Something is left that no candidate explains."
+    if diagnosis.verdict == "adequate":
+        return "adequate. What the model leaves is noise: it depends on nothing that runs along the model."
+    if diagnosis.verdict == "named":
+        return f"{causes}.{left}"
+    if diagnosis.verdict == "ambiguous":
+        said = [
+            f"{a.causes[0]} or {' or '.join(a.causes[1:])}" for a in diagnosis.alternatives
+        ]  # fmt: skip
+        alone = [c for c in diagnosis.causes if all(c not in a.causes for a in diagnosis.alternatives)]
+        return "ambiguous: " + "; and ".join([*alone, *said]) + f": this record cannot tell.{left}"
+    return "unexplained. Something is missing, and no effect of the bank leaves an innocent residual."
+
+
+def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return what the nominal model gets wrong, a line for each output."""
+    lines = []
+    for name, m in diagnosis.misfit.outputs.items():
+        unit = diagnosis.fit.model.unit(name)
+        kind = "coloured" if m.coloured else "white"
+        lines.append(
+            f"{name}: rmse {m.rmse:.4g} {unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
+            f"{100 * m.above_noise:.1f}% of the squared error is misfit"
+        )
+        if m.outliers.any():
+            lines.append(f"  {int(m.outliers.sum())} readings stand alone; they were left out")
+        if m.lattice is not None:
+            share = m.lattice**2 / 12.0 / m.noise_floor**2
+            lines.append(
+                f"  the readings lie on a lattice of {m.lattice:.3g} {unit}: {100 * min(share, 1.0):.0f}% of the noise"
+            )
+    first = diagnosis.misfit.tests[0]
+    if diagnosis.verdict != "adequate":
+        lines.append(
+            f"the residual depends on {first.quantity} (seen from {first.place}): p = {_p(first.corrected)} for all "
+            f"{len(diagnosis.misfit.tests)} tests together"
+        )
+    return lines
+
+
+def cause_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return the causes with their sizes, or the missing term."""
+    lines = []
+    included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
+    for row in included.itertuples():
+        numbers = {
+            name.removeprefix(f"{row.cause}."): value
+            for name, value in diagnosis.extended.parameters.items()
+            if name.startswith(f"{row.cause}.")
+        }
+        said = ", ".join(
+            f"{name} {value:.4g} {diagnosis.extended.model.parameter(f'{row.cause}.{name}').unit}".rstrip()
+            for name, value in numbers.items()
+        )
+        lines.append(f"{row.cause} at {row.signal}: {said}; without it {row.likelihood_gain:.4g} noise variances worse")
+    m = diagnosis.missing
+    if m is not None:
+        unit = "of its value" if m.relative else m.unit
+        peak = int(np.argmax(np.abs(m.estimate)))
+        lines.append(
+            f"missing at {m.place}, as a function of {m.quantity}: up to {m.estimate[peak]:.3g} +/- "
+            f"{m.deviation[peak]:.2g} {unit} at {m.at[peak]:.3g} {m.quantity_unit} (see .missing and .plot())"
+        )
+    return lines
+
+
+def gain_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return what the extension gains, a line for each output."""
+    lines = []
+    for name, g in diagnosis.gain.outputs.items():
+        unit = diagnosis.fit.model.unit(name)
+        if diagnosis.extended.model is diagnosis.fit.model:
+            lines.append(
+                f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g} {unit}, noise {g.noise_floor:.4g} {unit}"
+            )  # fmt: skip
+            continue
+        line = (
+            f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g} {unit} "
+            f"(noise {g.noise_floor:.4g}), fit {g.fit_before:.2f} -> {g.fit_after:.2f}%"
+        )
+        if np.isfinite(g.share_removed):
+            low, high = g.share_interval
+            line += (
+                f"; {100 * g.share_removed:.1f}% of the removable error removed "
+                f"(95%: {100 * low:.1f} to {100 * high:.1f})"
+            )
+        lines.append(line)
+    return lines
+
+
+def next_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return what to do next, and what the record excludes."""
+    lines = [
+        f"to tell {' from '.join(a.causes)}: {a.settled_by}" for a in diagnosis.alternatives if a.settled_by
+    ]  # fmt: skip
+    if diagnosis.verdict == "unexplained":
+        lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
+    if diagnosis.verdict == "adequate":
+        said = "; ".join(f"{e.cause} above {e.above:.2g} {e.unit}".rstrip() for e in diagnosis.excluded[:_NAMED])
+        more = len(diagnosis.excluded) - _NAMED
+        lines.append(
+            f"excluded, as it would be found in 95% of such records: {said}"
+            + (f"; and {more} more (see .excluded)" if more > 0 else "")
+        )
+        if diagnosis.unseen:
+            lines.append(f"cannot be seen in this record: {', '.join(diagnosis.unseen)}")
+    return lines
+
+
+def _p(p: float) -> str:
+    return f"{p:.2g}" if p > 1e-12 else "0"

@@ -1,0 +1,229 @@
+"""The model with every candidate effect attached at once, each absent: one program for all that is tried.
+
+A point is a row of coordinates: those of the model's free parameters, then those of every effect's numbers, then those
+of the initial conditions. What is tried differs in its data only, so that nothing is compiled twice.
+"""
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates
+from ehsvjax.effects.extended import disturbance, extended
+from ehsvjax.effects.internal import Internal, internal_signals
+from ehsvjax.fit import Fit
+from ehsvjax.models.model import Model, Parameter
+from ehsvjax.population import Problem, cast, simulated, to_unit, to_values
+from ehsvjax.record import Record
+from ehsvjax.unknowns import problem_of
+
+# Kinds of signals at which a missing term is looked for.
+PLACES = ("force", "load", "opening", "supply", "damping", "displacement")
+# Simulated side by side, of those that are compared and of those that are refined.
+_ABREAST = 16
+REFINED_ABREAST = 8
+
+
+
+@dataclass(frozen=True, eq=False)
+class Workbench:
+    """A fit and a record, ready for trials.
+
+    Attributes:
+        fit: the fit that is diagnosed.
+        model: its model with every candidate attached, and with disturbances.
+        problem: of that model and the record, in NumPy float64; an effect's number has its scale as unit.
+        candidates: the effects at signals of the model.
+        scales: of each candidate.
+        internal: what runs along the nominal model's signals.
+        places: signals that can be disturbed by a series.
+        column: name of an unknown -> its column; initial conditions are `name[record]`.
+        nominal: `[parameter]` the point at which every effect is absent.
+
+    """
+
+    fit: Fit
+    model: Model
+    problem: Problem
+    candidates: tuple[Candidate, ...]
+    scales: dict[str, Scales]
+    internal: Internal
+    places: tuple[str, ...]
+    column: dict[str, int]
+    nominal: Float[np.ndarray, " parameter"]
+
+    @property
+    def base_columns(self) -> list[int]:
+        """Columns of the nominal model's unknowns, initial conditions included."""
+        own = {self.column[c.parameter(p.name)] for c in self.candidates for p in c.effect.parameters}
+        return [j for j in range(len(self.nominal)) if j not in own]
+
+    def columns_of(self, candidate: Candidate) -> list[int]:
+        """Columns of an effect's numbers."""
+        return [self.column[candidate.parameter(p.name)] for p in candidate.effect.parameters]
+
+    def value(self, point: Float[np.ndarray, " parameter"], name: str) -> float:
+        """Value of one unknown at a point, SI."""
+        return float(to_values(self.problem.coordinates, point)[self.column[name]])
+
+    def simulated(
+        self,
+        points: Float[np.ndarray, "individual parameter"],
+        disturbances: Float[np.ndarray, "individual record time place"] | None = None,
+    ) -> Float[np.ndarray, "individual record time signal"]:
+        """Return the outputs of each point, SI, with what is added to signals while they run."""
+        shape = (*self.problem.samples.inputs.shape[:2], len(self.places))
+        rows = []
+        with jax.enable_x64(True):
+            problem = cast(self.problem, jnp.float64)
+            for first in range(0, len(points), _ABREAST):
+                some = points[first : first + _ABREAST]
+                added = np.zeros((_ABREAST, *shape))
+                if disturbances is not None:
+                    added[: len(some)] = disturbances[first : first + _ABREAST]
+                filled = _filled(some, _ABREAST)
+                rows.append(np.asarray(_simulated(problem, jnp.asarray(filled), jnp.asarray(added)))[: len(some)])
+        return np.concatenate(rows)
+
+    def linearised(
+        self, points: Float[np.ndarray, "individual parameter"], chosen: Int[np.ndarray, "individual direction"]
+    ):
+        """Return outputs `[individual, record, time, signal]` and their derivatives `[direction, individual, ...]`.
+
+        Args:
+            points: at most `REFINED_ABREAST` of them are computed side by side.
+            chosen: columns along which to differentiate; -1 gives zero.
+
+        """
+        outputs, slopes = [], []
+        with jax.enable_x64(True):
+            problem = cast(self.problem, jnp.float64)
+            for first in range(0, len(points), REFINED_ABREAST):
+                some = slice(first, first + REFINED_ABREAST)
+                count = len(points[some])
+                y, slope = _linearised(
+                    problem,
+                    jnp.asarray(_filled(points[some], REFINED_ABREAST)),
+                    jnp.asarray(_filled(chosen[some], REFINED_ABREAST)),
+                )
+                outputs.append(np.asarray(y)[:count])
+                slopes.append(np.asarray(slope)[:, :count])
+        return np.concatenate(outputs), np.concatenate(slopes, axis=1)
+
+
+def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
+    """Set up the trials of a fit on a record; nothing is compiled for them yet.
+
+    Args:
+        fit: of the nominal model.
+        record: to diagnose it on.
+        bank: the candidate effects.
+
+    """
+    model = fit.model
+    initial = fit.initial_of(record)
+    internal = internal_signals(model, record, fit.parameters, initial)
+    found = candidates(model, bank, internal.contexts, tuple(record.outputs))
+    scales = {c.name: _scales(c, internal, record) for c in found}
+    places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
+    duration = len(record) * record.sample_period
+    numbers = {c.parameter(p.name): _free(c, p, model, scales[c.name]) for c in found for p in c.effect.parameters}
+    full = extended(model, found, numbers, duration, places)
+    quiet = {disturbance(place): np.zeros(len(record)) for place in places}
+    known = {n: v for n, v in initial.items() if n not in fit.estimated_initial}
+    problem = problem_of(
+        full,
+        [replace(record, inputs={**record.inputs, **quiet})],
+        initial=known,
+        noise_variance={n: fit.noise_variance[n] for n in record.outputs},
+    )
+    names = [*problem.free, *problem.free_initial]
+    column = {name: j for j, name in enumerate(names)}
+    coordinates = problem.coordinates
+    nominal = np.zeros(len(names))
+    for c in found:
+        for p in c.effect.parameters:
+            j = column[c.parameter(p.name)]
+            tried = p.tries(scales[c.name])
+            unit = max((abs(t) for t in tried), default=1.0) or 1.0
+            coordinates.lower[j], coordinates.upper[j] = 0.0, unit
+            nominal[j] = (p.absent if p.absent is not None else (tried[0] if len(tried) else unit)) / unit
+    values = {**fit.parameters, **initial}
+    own = {column[c.parameter(p.name)] for c in found for p in c.effect.parameters}
+    for name, j in column.items():
+        if j not in own:
+            one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
+            nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
+    return Workbench(fit, full, problem, found, scales, internal, places, column, nominal)
+
+
+def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
+    def largest(series):
+        return float(np.max(np.abs(series))) if np.all(np.isfinite(series)) else 0.0
+
+    signal = candidate.signal
+    value = record.inputs.get(signal, internal.values.get(signal, np.ones(1)))
+    context = {name: largest(series) for name, series in internal.contexts.get(signal, {}).items()}
+    return {
+        **context,
+        "value": largest(value),
+        "duration": len(record) * record.sample_period,
+        "sample_period": record.sample_period,
+        # Where the search begins; it goes where the residual is strongest.
+        "frequencies": (2.0 * np.pi / record.sample_period / len(record),),
+        "modulations": (2.0 * np.pi / record.sample_period / len(record),),
+    }
+
+
+def _free(candidate: Candidate, number: EffectParameter, model: Model, scales: Scales) -> Parameter:
+    """Return an effect's number as a free parameter, between the bounds that make sense at all."""
+    unit = unit_of(candidate, number, model)
+    lower, upper = number.lower(scales), number.upper(scales)
+    value = min(max(0.0, lower), upper)
+    name = candidate.parameter(number.name)
+    return Parameter(name, name, unit, value, lower, max(upper, lower + 1e-300))
+
+
+def unit_of(candidate: Candidate, number: EffectParameter, model: Model) -> str:
+    """Return the unit of an effect's number at its signal; none where the model is dimensionless there."""
+    unit = _unit(candidate, model)
+    return "" if "{value}" in number.unit and not unit else number.unit.replace("{value}", unit)
+
+
+def _unit(candidate: Candidate, model: Model) -> str:
+    if candidate.effect.kind == "parameter":
+        return model.parameter(candidate.signal).unit
+    return model.unit(candidate.signal)
+
+
+def _filled(rows, count):
+    return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
+
+
+def _disturbed(problem: Problem, point, added) -> Float[Array, "record time signal"]:
+    count = added.shape[-1]
+    inputs = problem.samples.inputs
+    inputs = inputs.at[..., inputs.shape[-1] - count :].set(added) if count else inputs
+    return simulated(replace(problem, samples=problem.samples._replace(inputs=inputs)), point)
+
+
+@jax.jit
+def _simulated(problem: Problem, points, added):
+    return jax.vmap(functools.partial(_disturbed, problem))(points, added)
+
+
+@jax.jit
+def _linearised(problem: Problem, points, chosen):
+    every = jax.vmap(functools.partial(simulated, problem))
+    columns = jnp.arange(points.shape[1])
+
+    def along(column):
+        directions = (columns[None, :] == column[:, None]).astype(points.dtype)
+        return jax.jvp(every, (points,), (directions,))
+
+    return jax.vmap(along, out_axes=(None, 0))(chosen.T)

@@ -1,0 +1,25 @@
+"""Effects that a model may lack: the bank of candidate causes, and models extended by them."""
+
+from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, amplitude, candidates, limit, shape, size, width
+from ehsvjax.effects.extended import effects_of, extended
+from ehsvjax.effects.forces import FORCE, FRICTION, LOAD
+from ehsvjax.effects.series import INPUT, SENSOR
+from ehsvjax.effects.valve import DAMPING, DISPLACEMENT, DRIFT, VALVE
+
+BANK: tuple[Effect, ...] = (*INPUT, *SENSOR, *FORCE, *LOAD, *FRICTION, *VALVE, *DAMPING, *DISPLACEMENT, *DRIFT)
+"""Every effect of this package; `diagnose(..., bank=(*BANK, my_effect))` adds one of yours."""
+
+__all__ = [
+    "BANK",
+    "Candidate",
+    "Effect",
+    "EffectParameter",
+    "amplitude",
+    "candidates",
+    "effects_of",
+    "extended",
+    "limit",
+    "shape",
+    "size",
+    "width",
+]

@@ -1,0 +1,174 @@
+"""What an effect is: a disturbance of one named signal of a model, with parameters that can make it vanish."""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ehsvjax.models.model import Model
+
+Scales = Mapping[str, Any]
+"""How large things are in a record: `value`, the largest size of the signal itself, and of each quantity of its
+context by name (0 where nothing is known), `duration` and `sample_period` in s, `frequencies` in rad/s at which the
+residual is strongest, and `modulations`, at which its product with the motion is."""
+
+UNLIMITED = 1e30
+"""A limit that nothing reaches."""
+
+
+class EffectParameter(NamedTuple):
+    """One number of an effect.
+
+    Attributes:
+        name: in the field's terms, `coefficient`.
+        unit: SI; `{value}` in it stands for the unit of the signal.
+        absent: the value with which the effect is not there, if this parameter makes it vanish: 0 for an amplitude,
+            `UNLIMITED` for a limit; None for a shape (a frequency, a width) that means nothing without the amplitude.
+        lower, upper: the least and the largest value that make sense, from the scales; an amplitude with a lower bound
+            of zero has one sign.
+        tries: values that the screening simulates, from the scales: one small probe for an amplitude whose effect is
+            proportional to it, several for one whose effect is not, or for a shape.
+
+    """
+
+    name: str
+    unit: str
+    absent: float | None
+    lower: Callable[[Scales], float]
+    upper: Callable[[Scales], float]
+    tries: Callable[[Scales], Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A candidate cause: what it does to a signal of one kind.
+
+    Attributes:
+        name: in the field's terms, `transport_delay`.
+        kind: of the signals at which it can act, `Signal.kind`; or "parameter", for the value of a free parameter.
+        parameters: its own numbers.
+        apply: `apply(own, value, context)` returns the disturbed value; `own` are its numbers by name, `context` what
+            the model passes with the signal and `time` s, `step_size` s, `duration` s of the record. With a memory:
+            `apply(own, value, context, memory)` returns the value and the new memory. For an input the value is the
+            whole series `[time]`.
+        needs: names of quantities that the context must hold; the effect is no candidate where it does not.
+        memory: what it remembers at the start, scalars; NaN is a good mark for "nothing yet". The memory moves on once
+            a step, by the value at its start.
+        says: what it is, in half a sentence.
+        settled_by: the experiment or the sensor that tells it from what looks like it.
+
+    """
+
+    name: str
+    kind: str
+    parameters: tuple[EffectParameter, ...]
+    apply: Callable[..., Any]
+    needs: tuple[str, ...] = ()
+    memory: tuple[float, ...] = ()
+    says: str = ""
+    settled_by: str = ""
+
+
+class Candidate(NamedTuple):
+    """An effect at one signal of a model, and the name under which it is reported there."""
+
+    effect: Effect
+    signal: str
+    name: str
+
+    def parameter(self, own: str) -> str:
+        """Name of one of the effect's numbers among the parameters of an extended model."""
+        return f"{self.name}.{own}"
+
+
+def candidates(
+    model: Model, bank: Sequence[Effect], contexts: Mapping[str, Collection[str]], observed: Collection[str]
+) -> tuple[Candidate, ...]:
+    """Return every effect of the bank at every signal of the model that takes it and could show it.
+
+    Its name is the effect's, followed by `@signal` where more than one signal takes effects of this name.
+
+    Args:
+        model: the model.
+        bank: effects; two of one name are two forms of it.
+        contexts: for each signal that the model passes values through, the names in its context.
+        observed: the outputs that are measured: an effect on the sensor of another could not show.
+
+    """
+
+    def takes(effect, signal):
+        if signal.kind != effect.kind or (signal.kind == "sensor" and signal.name not in observed):
+            return False
+        return signal.kind == "input" or (
+            signal.name in contexts and set(effect.needs) <= set(contexts[signal.name])
+        )  # fmt: skip
+
+    # A valve's flow gain drifts at its opening; to let its other parameters drift, its transfer function would have
+    # to be set up anew at every step.
+    drifting = () if any(s.kind == "opening" for s in model.signals) else model.free
+    found = []
+    for effect in bank:
+        places = drifting if effect.kind == "parameter" else [s.name for s in model.signals if takes(effect, s)]
+        found += [(effect, place) for place in places]
+    places_of: dict[str, set[str]] = {}
+    for effect, place in found:
+        places_of.setdefault(effect.name, set()).add(place)
+    return tuple(
+        Candidate(effect, place, effect.name if len(places_of[effect.name]) == 1 else f"{effect.name}@{place}")
+        for effect, place in found
+    )
+
+
+def constant(value: float) -> Callable[[Scales], float]:
+    """Return a bound that does not depend on scales."""
+    return lambda scales: value
+
+
+def amplitude(
+    name: str,
+    unit: str,
+    probe: Callable[[Scales], float],
+    lower: Callable[[Scales], float] = constant(-UNLIMITED),
+    upper: Callable[[Scales], float] = constant(UNLIMITED),
+) -> EffectParameter:
+    """Return a number to which the effect is proportional, at least while it is small."""
+    return EffectParameter(name, unit, 0.0, lower, upper, lambda scales: (probe(scales),))
+
+
+def size(
+    name: str,
+    unit: str,
+    probe: Callable[[Scales], float],
+    upper: Callable[[Scales], float] = constant(UNLIMITED),
+) -> EffectParameter:
+    """Return an amplitude that is never negative."""
+    return amplitude(name, unit, probe, constant(0.0), upper)
+
+
+def width(name: str, unit: str, tries: Sequence[float], upper: float = 0.5) -> EffectParameter:
+    """Return a width that is never negative and whose effect is not proportional to it; shares of the signal's size."""
+    return EffectParameter(
+        name, unit, 0.0, constant(0.0), lambda s: upper * s["value"], lambda s: [t * s["value"] for t in tries]
+    )
+
+
+def limit(name: str, unit: str, tries: Sequence[float], lower: float = 0.02) -> EffectParameter:
+    """Return a level that the signal does not pass; shares of the signal's size."""
+    return EffectParameter(
+        name,
+        unit,
+        UNLIMITED,
+        lambda s: lower * s["value"],
+        lambda s: 1.02 * s["value"],
+        lambda s: [t * s["value"] for t in tries],
+    )
+
+
+def shape(
+    name: str,
+    unit: str,
+    tries: Callable[[Scales], Sequence[float]],
+    lower: Callable[[Scales], float],
+    upper: Callable[[Scales], float],
+) -> EffectParameter:
+    """Return a number that means nothing while the amplitude is zero."""
+    return EffectParameter(name, unit, None, lower, upper, tries)

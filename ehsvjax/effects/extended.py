@@ -1,0 +1,183 @@
+"""A model with effects attached: a model like any other."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from ehsvjax.effects.effect import Candidate
+from ehsvjax.models.model import Equations, Model, Parameter, Signal, identity
+
+DURATION = "record_duration"
+"""Constant of an extended model: the time over which a drift is counted, s."""
+
+
+class ExtendedState(NamedTuple):
+    """The model's own state, the time since the record's start, and the effects' memories by their names."""
+
+    state: Any
+    time: Any
+    memories: dict[str, Any]
+
+
+def extended(
+    model: Model,
+    attached: Sequence[Candidate],
+    parameters: Mapping[str, Parameter],
+    duration: float,
+    disturbed: Sequence[str] = (),
+) -> Model:
+    """Return the model with effects attached at its signals.
+
+    Its further parameters are the effects' own numbers, `name.number`; a model that is extended already is extended
+    further. The same equations with the same effects are compiled once.
+
+    Args:
+        model: the model to extend.
+        attached: effects at signals of it.
+        parameters: of each number of the effects by its name in the model: value and bounds.
+        duration: s over which drifts are counted.
+        disturbed: signals to which a series of any form can be added: the model has an input `disturbance(name)` for
+            each of them.
+
+    """
+    equations = _equations(model.equations, tuple(attached), tuple(disturbed))
+    constants = () if any(p.name == DURATION for p in model.parameters) else (
+        Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True),
+    )  # fmt: skip
+    own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
+    return replace(
+        model,
+        signals=(*model.signals, *(Signal(disturbance(place), "input", "") for place in disturbed)),
+        name=f"{model.name.partition(' with ')[0]} with " + ", ".join([*_names(model), *(c.name for c in attached)]),
+        parameters=(*model.parameters, *constants, *own),
+        start=equations.start,
+        stepper=equations.stepper,
+        measure=equations.measure,
+        prepare=equations.prepare,
+        options=(*model.options, ("effects", tuple(c.name for c in attached))),
+    )
+
+
+def disturbance(signal: str) -> str:
+    """Name of the input that is added to a signal."""
+    return f"disturbance of {signal}"
+
+
+def _names(model: Model) -> list[str]:
+    return [name for key, names in model.options if key == "effects" for name in names]
+
+
+def effects_of(model: Model) -> tuple[str, ...]:
+    """Return the names of the effects that a model was extended by."""
+    return tuple(_names(model))
+
+
+@functools.cache
+def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[str, ...]) -> Equations:
+    """Return the equations with effects, the same objects for the same effects."""
+    inputs = tuple(c for c in attached if c.effect.kind == "input")
+    drifting = tuple(c for c in attached if c.effect.kind == "parameter")
+    remembering = tuple(c for c in attached if c.effect.memory and c.effect.kind != "input")
+    sensing = {c.name for c in remembering if c.signal in base.outputs}
+    inside = {c.name for c in remembering} - sensing
+    names = (*base.inputs, *(disturbance(place) for place in places))
+    at_signal: dict[str, list[Candidate]] = {}
+    for candidate in attached:
+        if candidate.effect.kind not in ("input", "parameter"):
+            at_signal.setdefault(candidate.signal, []).append(candidate)
+
+    def own_of(candidate, parameters):
+        return {p.name: parameters[candidate.parameter(p.name)] for p in candidate.effect.parameters}
+
+    def disturbing(parameters, signal, current):
+        """Return the signal function with the effects behind it, at the moment that `current` holds."""
+
+        def disturbed(name, value, **context):
+            value = signal(name, value, **context)
+            (moment,) = current
+            if name in moment.added:
+                value = value + moment.added[name]
+            context |= {"duration": parameters[DURATION], "time": moment.time, "step_size": moment.step_size}
+            for candidate in at_signal.get(name, ()):
+                own = own_of(candidate, parameters)
+                if not candidate.effect.memory:
+                    value = candidate.effect.apply(own, value, context)
+                    continue
+                value, memory = candidate.effect.apply(own, value, context, moment.memories[candidate.name])
+                moment.remember(candidate.name, memory)
+            return value
+
+        return disturbed
+
+    def drifted(parameters, time):
+        if not drifting:
+            return parameters
+        context = {"duration": parameters[DURATION], "time": time}
+        changed = dict(parameters)
+        for c in drifting:
+            changed[c.signal] = c.effect.apply(own_of(c, parameters), changed[c.signal], context)
+        return changed
+
+    def start(parameters, initial, series):
+        state = base.start(parameters, initial, series)
+        memories = {c.name: tuple(jnp.asarray(m) for m in c.effect.memory) for c in remembering}
+        moment = _Moment(0.0, 0.0, memories, sensing)
+        if sensing:
+            base.measure(parameters, state, series, disturbing(parameters, identity, [moment]))
+        return ExtendedState(state, 0.0, moment.memories)
+
+    def stepper(parameters, step_size, signal):
+        # Without drifts what does not change is computed once; signals outside the time loop have no memory.
+        outside = _Moment(0.0, step_size, {}, set())
+        current = [outside]
+        disturbed = disturbing(parameters, signal, current)
+        steady = None if drifting else base.stepper(parameters, step_size, disturbed)
+
+        def step(state, series):
+            begin = series(0.0) if places else {}
+            added = {place: begin[disturbance(place)] for place in places}
+            current[0] = _Moment(state.time, step_size, state.memories, inside, added)
+            now = drifted(parameters, state.time)
+            once = base.stepper(now, step_size, disturbed) if steady is None else steady
+            following = once(state.state, series)
+            time = state.time + step_size
+            if sensing:
+                current[0] = _Moment(time, step_size, current[0].memories, sensing)
+                base.measure(now, following, series(1.0), disturbed)
+            return ExtendedState(following, time, current[0].memories)
+
+        return step
+
+    def measure(parameters, state, series, signal):
+        # The memories have moved on to this moment: no time is left for them to do so.
+        moment = _Moment(state.time, 0.0, state.memories, set())
+        disturbed = disturbing(parameters, signal, [moment])
+        return base.measure(drifted(parameters, state.time), state.state, series, disturbed)
+
+    def prepare(parameters, series, sample_period):
+        series = series if base.prepare is None else base.prepare(parameters, series, sample_period)
+        time = sample_period * jnp.arange(series.shape[0], dtype=series.dtype)
+        context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
+        columns = dict(zip(names, jnp.moveaxis(series, -1, 0), strict=True))
+        for c in inputs:
+            columns[c.signal] = c.effect.apply(own_of(c, parameters), columns[c.signal], context)
+        return jnp.stack([columns[name] for name in names], axis=-1)
+
+    prepare = prepare if inputs else base.prepare
+    return base._replace(start=start, stepper=stepper, measure=measure, prepare=prepare, inputs=names)
+
+
+class _Moment:
+    """The time and the memories at one moment, while a step is traced; the first call at a signal moves its memory on."""
+
+    def __init__(self, time, step_size, memories, moving, added=None):
+        self.time, self.step_size, self.memories, self._moving = time, step_size, dict(memories), set(moving)
+        self.added = added or {}
+
+    def remember(self, name, memory):
+        if name in self._moving:
+            self._moving.discard(name)
+            self.memories[name] = memory

@@ -1,0 +1,261 @@
+"""Effects on forces: friction, stiffness, constant and harmonic forces, in the signs of a driving force and of a load."""
+
+import functools
+
+import jax.numpy as jnp
+
+from ehsvjax.effects.effect import Effect, EffectParameter, Scales, amplitude, constant, shape, size
+
+# A force has no size that could be known before it was tried: probes start from this, SI, and are enlarged.
+_PROBE = 1e-3
+# Of an end stop, N/m: stiff enough for any stop, and soft enough for an explicit force at a quarter of a millisecond.
+_STOP_STIFFNESS = 3e7
+
+
+def _per(quantity: str, power: int):
+    return lambda scales: _PROBE / max(scales[quantity], 1e-300) ** power
+
+
+def _frequency(tried: str) -> EffectParameter:
+    return shape(
+        "frequency",
+        "rad/s",
+        lambda scales: scales[tried],
+        lambda scales: 3.0 / scales["duration"],
+        lambda scales: 2.0 / scales["sample_period"],
+    )
+
+
+def _sign(velocity):
+    """Sign of a velocity; zero at rest."""
+    return velocity / jnp.maximum(jnp.abs(velocity), 1e-12)
+
+
+def _resisting(term, own, value, context):
+    return value + term(own, context)
+
+
+def _driving(term, own, value, context):
+    return value - term(own, context)
+
+
+def _load(name, parameters, term, *, needs=("position", "velocity"), says="", settled_by=""):
+    return Effect(name, "load", parameters, functools.partial(_resisting, term), needs, (), says, settled_by)
+
+
+def _force(name, parameters, term, *, needs=("position", "velocity"), says="", settled_by=""):
+    return Effect(name, "force", parameters, functools.partial(_driving, term), needs, (), says, settled_by)
+
+
+def _viscous(own, context):
+    return own["coefficient"] * context["velocity"]
+
+
+def _cubic(own, context):
+    return own["coefficient"] * context["position"] ** 3
+
+
+def _harmonic(own, context):
+    angle = own["frequency"] * context["time"]
+    return -(own["cosine"] * jnp.cos(angle) + own["sine"] * jnp.sin(angle))
+
+
+def _harmonic_parameters(unit):
+    return (amplitude("cosine", unit, constant(_PROBE)), amplitude("sine", unit, constant(_PROBE)), _frequency("frequencies"))
+
+
+def _stribeck_shape(scales: Scales):
+    return [share * scales["velocity"] for share in (0.01, 0.05, 0.2)]
+
+
+def _stribeck_parameters(unit):
+    return (
+        size("force", unit, constant(_PROBE)),
+        shape("velocity", "m/s", _stribeck_shape, lambda s: 1e-3 * s["velocity"], lambda s: 0.5 * s["velocity"]),
+    )
+
+
+def _stribeck(own, velocity):
+    return own["force"] * jnp.exp(-((velocity / own["velocity"]) ** 2))
+
+
+def _stop(side):
+    """Return the force of a stop on one side, and its tries, shares of the largest position."""
+
+    end = "positive_end" if side > 0 else "negative_end"
+
+    def term(own, context):
+        depth = jnp.maximum(side * context["position"] - own[end], 0.0)
+        return side * _STOP_STIFFNESS * depth
+
+    position = EffectParameter(
+        end, "m", 1e30, lambda s: 0.02 * s["position"], lambda s: 1.02 * s["position"],
+        lambda s: [t * s["position"] for t in (0.98, 0.9, 0.75)],
+    )  # fmt: skip
+    return _load(
+        "end_stop",
+        (position,),
+        term,
+        says=f"the motion ends at a stop on the {'positive' if side > 0 else 'negative'} side",
+        settled_by="move to the end by hand, with a gauge: a stop stops the load, a sensor's end does not",
+    )
+
+
+_MEASURE_PRESSURE = "measure the load pressure"
+_TWO_AMPLITUDES = "two amplitudes, and free decay"
+
+FRICTION = (
+    Effect(
+        "coulomb_friction",
+        "friction",
+        (size("force", "{value}", constant(_PROBE)),),
+        lambda own, value, context: value + own["force"],
+        says="dry friction of constant size",
+        settled_by=_MEASURE_PRESSURE,
+    ),
+    Effect(
+        "stribeck_friction",
+        "friction",
+        _stribeck_parameters("{value}"),
+        lambda own, value, context: value + _stribeck(own, context["velocity"]),
+        needs=("velocity",),
+        says="dry friction that is larger at small velocities",
+        settled_by=f"{_MEASURE_PRESSURE}, at slow motion",
+    ),
+)
+
+LOAD = (
+    _load(
+        "constant_load",
+        (amplitude("force", "{value}", constant(_PROBE)),),
+        lambda own, context: own["force"],
+        says="a constant force on the piston",
+        settled_by=f"half the supply pressure; or {_MEASURE_PRESSURE}",
+    ),
+    _load(
+        "viscous_friction",
+        (size("coefficient", "{value}/(m/s)", _per("velocity", 1)),),
+        _viscous,
+        says="friction in proportion to velocity",
+        settled_by="measure the supply or the load pressure",
+    ),
+    _load(
+        "hardening_spring",
+        (amplitude("coefficient", "{value}/m^3", _per("position", 3)),),
+        _cubic,
+        says="the load's spring becomes stiffer with its stroke",
+        settled_by=f"{_MEASURE_PRESSURE} at several positions",
+    ),
+    _load(
+        "harmonic_load",
+        _harmonic_parameters("{value}"),
+        _harmonic,
+        says="a periodic force on the piston",
+        settled_by="a record at rest: a hum of the sensor is there too, a load on a closed valve is not",
+    ),
+    _stop(1.0),
+    _stop(-1.0),
+)
+
+FORCE = (
+    _force(
+        "constant_force",
+        (amplitude("force", "{value}", constant(_PROBE)),),
+        lambda own, context: -own["force"],
+        needs=(),
+        says="a constant force",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "coulomb_friction",
+        (size("force", "{value}", constant(_PROBE)),),
+        lambda own, context: own["force"] * _sign(context["velocity"]),
+        needs=("velocity",),
+        says="dry friction of constant size",
+        settled_by="slow motion in both directions",
+    ),
+    _force(
+        "stribeck_friction",
+        _stribeck_parameters("{value}"),
+        lambda own, context: _stribeck(own, context["velocity"]) * _sign(context["velocity"]),
+        needs=("velocity",),
+        says="dry friction that is larger at small velocities",
+        settled_by="slow motion in both directions",
+    ),
+    _force(
+        "linear_damping",
+        (amplitude("coefficient", "{value}/(m/s)", _per("velocity", 1)),),
+        _viscous,
+        needs=("velocity",),
+        says="a force in proportion to velocity",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "quadratic_damping",
+        (amplitude("coefficient", "{value}/(m/s)^2", _per("velocity", 2)),),
+        lambda own, context: own["coefficient"] * context["velocity"] * jnp.abs(context["velocity"]),
+        needs=("velocity",),
+        says="drag in proportion to the square of velocity",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "rayleigh_damping",
+        (amplitude("coefficient", "{value}/(m/s)^3", _per("velocity", 3)),),
+        lambda own, context: own["coefficient"] * context["velocity"] ** 3,
+        needs=("velocity",),
+        says="a force in proportion to the cube of velocity",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "linear_stiffness",
+        (amplitude("coefficient", "{value}/m", _per("position", 1)),),
+        lambda own, context: own["coefficient"] * context["position"],
+        needs=("position",),
+        says="a spring more or less",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "quadratic_stiffness",
+        (amplitude("coefficient", "{value}/m^2", _per("position", 2)),),
+        lambda own, context: own["coefficient"] * context["position"] ** 2,
+        needs=("position",),
+        says="a spring that is stiffer on one side",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "cubic_stiffness",
+        (amplitude("coefficient", "{value}/m^3", _per("position", 3)),),
+        _cubic,
+        needs=("position",),
+        says="a spring that becomes stiffer with its stroke, by the third power",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "quintic_stiffness",
+        (amplitude("coefficient", "{value}/m^5", _per("position", 5)),),
+        lambda own, context: own["coefficient"] * context["position"] ** 5,
+        needs=("position",),
+        says="a spring that becomes stiffer with its stroke, by the fifth power",
+        settled_by=_TWO_AMPLITUDES,
+    ),
+    _force(
+        "harmonic_force",
+        _harmonic_parameters("{value}"),
+        _harmonic,
+        needs=(),
+        says="a periodic force",
+        settled_by="a record at rest",
+    ),
+    _force(
+        "parametric_excitation",
+        (
+            amplitude("cosine", "{value}/m", _per("position", 1)),
+            amplitude("sine", "{value}/m", _per("position", 1)),
+            _frequency("modulations"),
+        ),
+        lambda own, context: -_harmonic(own, context) * context["position"],
+        needs=("position",),
+        says="a stiffness that changes periodically",
+        settled_by="records at two amplitudes: a force does not grow with them, a stiffness does",
+    ),
+)

@@ -1,0 +1,99 @@
+"""What runs along the named signals of a model while it is simulated: values, and the context of each."""
+
+import functools
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.models.model import Equations, Model, identity
+from ehsvjax.record import Record
+from ehsvjax.simulate import grid_of, simulate
+
+
+class Internal(NamedTuple):
+    """Along one trajectory, `[time]`, SI: `values` of each signal, and the quantities of its context by name."""
+
+    values: dict[str, Float[np.ndarray, " time"]]
+    contexts: dict[str, dict[str, Float[np.ndarray, " time"]]]
+
+
+def internal_signals(
+    model: Model, record: Record, parameters: Mapping[str, float], initial: Mapping[str, float]
+) -> Internal:
+    """Return what runs along the signals at the samples of a record, arguments as for `simulate`."""
+    grid = grid_of(model, record)
+    watched = _watched(model.equations, record.sample_period / grid.substeps)
+    names = _names_of(model, watched)
+    from dataclasses import replace
+
+    seen = simulate(
+        replace(
+            model,
+            measure=watched.measure,
+            signals=(*model.signals, *(model.signals[0]._replace(name=n, kind="sensor") for n in names)),
+        ),
+        record,
+        parameters,
+        initial,
+    )
+    values: dict[str, np.ndarray] = {}
+    contexts: dict[str, dict[str, np.ndarray]] = {}
+    for name in names:
+        signal, quantity = _parts(name)
+        if quantity:
+            contexts[signal][quantity] = seen[name]
+        else:
+            values[signal] = seen[name]
+            contexts.setdefault(signal, {})
+    return Internal(values, contexts)
+
+
+def _watch_name(signal: str, quantity: str = "") -> str:
+    return f"along {signal}|{quantity}"
+
+
+def _parts(name: str) -> tuple[str, str]:
+    signal, _, quantity = name.removeprefix("along ").partition("|")
+    return signal, quantity
+
+
+def _names_of(model: Model, watched: Equations) -> list[str]:
+    """Return the names under which the watched equations report, by tracing them once."""
+    import jax
+
+    def outputs():
+        values = {p.name: 1.0 for p in model.parameters}
+        initial = {p.name: 0.0 for p in model.initial}
+        inputs = dict.fromkeys(model.inputs, 0.0)
+        return watched.measure(values, model.start(values, initial, inputs), inputs, identity)
+
+    return [name for name in jax.eval_shape(outputs) if name.startswith("along ")]
+
+
+@functools.cache
+def _watched(base: Equations, step_size: float) -> Equations:
+    """Return equations whose outputs tell of the signals too: each as it is at the beginning of a step."""
+
+    def measure(parameters, state, inputs, signal):
+        seen = {}
+
+        def watching(name, value, **context):
+            value = signal(name, value, **context)
+            if _watch_name(name) not in seen:
+                seen[_watch_name(name)] = value
+                seen.update({_watch_name(name, quantity): size for quantity, size in context.items()})
+            return value
+
+        base.stepper(parameters, step_size, watching)(state, lambda fraction: inputs)
+        outputs = base.measure(parameters, state, inputs, watching)
+        return outputs | {name: 1.0 * _array(value) for name, value in seen.items()}
+
+    return base._replace(measure=measure)
+
+
+def _array(value):
+    import jax.numpy as jnp
+
+    return jnp.asarray(value)

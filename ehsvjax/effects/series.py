@@ -1,0 +1,214 @@
+"""Effects on an input, as a whole series before it is simulated, and on a sensor."""
+
+import jax.numpy as jnp
+from jax import lax
+
+from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, size, width
+
+
+def _small(scales: Scales) -> float:
+    return 1e-3 * scales["value"]
+
+
+def _tenth_of_duration(scales: Scales) -> float:
+    return 0.1 * scales["duration"]
+
+
+def _half_sample(scales: Scales) -> float:
+    return 0.5 * scales["sample_period"]
+
+
+def dead_zone(value, half_width):
+    """Return what lies beyond +-half_width, less that."""
+    return value - jnp.clip(value, -half_width, half_width)
+
+
+def play(value, memory, half_width):
+    """Return the output of a play (backlash, hysteresis) that stood at `memory`: it follows within +-half_width."""
+    return jnp.minimum(jnp.maximum(memory, value - half_width), value + half_width)
+
+
+def _delayed(own, series, context):
+    """Delay by any time, the mean over each sample of the held series; before the record it was zero."""
+    samples = own["delay"] / context["sample_period"]
+    whole = jnp.floor(samples)
+    part = samples - whole
+    at = jnp.arange(series.shape[0]) - whole.astype(int)
+
+    def earlier(index):
+        inside = jnp.clip(index, 0, series.shape[0] - 1)
+        return jnp.where(index >= 0, series[inside], 0.0)
+
+    return (1.0 - part) * earlier(at) + part * earlier(at - 1)
+
+
+def _lagged(own, series, context):
+    """First-order lag, the mean over each sample of what follows the held series; at rest before the record."""
+    ratio = context["sample_period"] / jnp.maximum(own["time_constant"], 1e-6 * context["sample_period"])
+    decay = jnp.exp(-ratio)
+    share = (1.0 - decay) / ratio
+
+    def follow(level, target):
+        return target + (level - target) * decay, target + (level - target) * share
+
+    # Before the record the command was what it first is, or zero; from rest it is zero.
+    return lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
+
+
+def _play_along(own, series, context):
+    del context
+
+    def follow(level, target):
+        level = play(target, level, own["half_width"])
+        return level, level
+
+    return lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
+
+
+def _sensor_lag(own, value, context, memory):
+    """Follow the value, which is a straight line between the steps; starts where the value is."""
+    level, before = (jnp.where(jnp.isnan(m), value, m) for m in memory)
+    time_constant = jnp.maximum(own["time_constant"], 1e-9)
+    ratio = context["step_size"] / time_constant
+    decay = jnp.exp(-ratio)
+    # With the slope of the line, what lags behind it is slope * time constant.
+    share = jnp.where(ratio > 1e-3, (1.0 - decay) / jnp.maximum(ratio, 1e-3), 1.0 - 0.5 * ratio)
+    level = decay * level + (share - decay) * before + (1.0 - share) * value
+    return level, (level, value)
+
+
+def _sensor_play(own, value, context, memory):
+    del context
+    level = play(value, memory[0], own["half_width"])
+    return level, (level,)
+
+
+
+INPUT = (
+    Effect(
+        "input_gain",
+        "input",
+        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
+        lambda own, u, context: u * (1.0 + own["error"]),
+        says="the input acts more or less than it says",
+        settled_by="measure the input at the plant",
+    ),
+    Effect(
+        "input_bias",
+        "input",
+        (amplitude("bias", "{value}", _small),),
+        lambda own, u, context: u + own["bias"],
+        says="the input is off by a constant",
+        settled_by="measure the input at the plant, at rest",
+    ),
+    Effect(
+        "transport_delay",
+        "input",
+        (size("delay", "s", _half_sample, _tenth_of_duration),),
+        _delayed,
+        says="the input acts later",
+        settled_by="a multisine of 5-40 Hz at two amplitudes: a delay turns the phase in proportion to frequency",
+    ),
+    Effect(
+        "input_lag",
+        "input",
+        (size("time_constant", "s", _half_sample, _tenth_of_duration),),
+        _lagged,
+        says="a first-order lag before the plant",
+        settled_by="a multisine of 5-40 Hz at two amplitudes: a lag attenuates, a delay does not",
+    ),
+    Effect(
+        "input_dead_zone",
+        "input",
+        (width("half_width", "{value}", (0.01, 0.04, 0.12)),),
+        lambda own, u, context: dead_zone(u, own["half_width"]),
+        says="small inputs do nothing",
+        settled_by="small inputs held for long, of both signs",
+    ),
+    Effect(
+        "input_saturation",
+        "input",
+        (limit("limit", "{value}", (0.97, 0.9, 0.75, 0.55)),),
+        lambda own, u, context: jnp.clip(u, -own["limit"], own["limit"]),
+        says="large inputs are cut off",
+        settled_by="a staircase of levels up to the largest input",
+    ),
+    Effect(
+        "input_hysteresis",
+        "input",
+        (width("half_width", "{value}", (0.005, 0.02, 0.06)),),
+        _play_along,
+        says="the input acts only once it has moved by more than a play",
+        settled_by="small triangles at three rates and amplitudes",
+    ),
+)
+
+SENSOR = (
+    Effect(
+        "sensor_gain",
+        "sensor",
+        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
+        lambda own, y, context: y * (1.0 + own["error"]),
+        says="the sensor shows more or less than there is",
+        settled_by="an external gauge",
+    ),
+    Effect(
+        "sensor_bias",
+        "sensor",
+        (amplitude("bias", "{value}", _small),),
+        lambda own, y, context: y + own["bias"],
+        says="the sensor is off by a constant",
+        settled_by="a gauge of the true zero",
+    ),
+    Effect(
+        "sensor_drift",
+        "sensor",
+        (amplitude("drift", "{value}", _small),),
+        lambda own, y, context: y + own["drift"] * context["time"] / context["duration"],
+        says="the sensor's zero moves as time passes",
+        settled_by="the same level at the beginning and at the end, by a gauge",
+    ),
+    Effect(
+        "sensor_cubic",
+        "sensor",
+        (amplitude("coefficient", "1/({value})^2", lambda s: 1e-3 / max(s["value"], 1e-300) ** 2),),
+        lambda own, y, context: y + own["coefficient"] * y**3,
+        says="the sensor is bent towards its ends",
+        settled_by="an external gauge at several levels",
+    ),
+    Effect(
+        "sensor_saturation",
+        "sensor",
+        (limit("limit", "{value}", (0.98, 0.93, 0.85, 0.7, 0.5)),),
+        lambda own, y, context: jnp.clip(y, -own["limit"], own["limit"]),
+        says="the sensor ends before the motion does",
+        settled_by="move to the end by hand, with a gauge",
+    ),
+    Effect(
+        "sensor_lag",
+        "sensor",
+        (size("time_constant", "s", _half_sample, _tenth_of_duration),),
+        _sensor_lag,
+        memory=(float("nan"), float("nan")),
+        says="the sensor follows with a lag",
+        settled_by="a multisine of 5-40 Hz, or a second, faster sensor",
+    ),
+    Effect(
+        "sensor_backlash",
+        "sensor",
+        (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
+        _sensor_play,
+        memory=(0.0,),
+        says="the sensor is coupled with play",
+        settled_by="small triangles at three rates and amplitudes, with a gauge",
+    ),
+    Effect(
+        "structural_flexibility",
+        "sensor",
+        (size("compliance", "{value}/N", lambda s: 1e-3 * s["value"] / max(s["load_force"], 1e-300)),),
+        lambda own, y, context: y + own["compliance"] * context["load_force"],
+        needs=("load_force",),
+        says="the mounting gives way under the load force",
+        settled_by="two loads at the same motion, or a sensor on the structure",
+    ),
+)

@@ -1,0 +1,575 @@
+"""Independent plants with hidden effects: a servovalve and a Van der Pol oscillator, NumPy over a batch of records.
+
+Nothing of the package is used here. Every record of a batch has its own effects, which the model to be diagnosed may
+or may not have; those named unknown_* are in no bank. SI units; a Gaussian of a given width is exp(-(z/width)^2/2).
+
+The load is stiff where the spool closes. It is stepped by Alexander's L-stable diagonally implicit Runge-Kutta method
+of two stages and second order, and each stage has a closed form: with w the signed root of the pressure drop, velocity
+and load pressure are linear in w and w|w|, and so the stage is a quadratic equation in w. Leakage and compressibility
+stay within that form. The spool's filter is propagated exactly for an input that is linear over a step.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+ANY_PHASE = (0.0, 0.0, 2.0 * math.pi)
+# Effect: parameter: (value that means absent, smallest, largest plausible size). Signed effects may be negated. Depths
+# are fractions. The oscillator's sizes move its position by about 1 to 20 % of its rms, for levels in +-1 held 1 s.
+SERVOVALVE_EFFECTS = {
+    "coulomb_friction": {"force": (0.0, 500.0, 3500.0)},
+    "stribeck_friction": {"force": (0.0, 200.0, 2000.0), "velocity": (1.0, 5e-3, 5e-2)},
+    "viscous_friction": {"coefficient": (0.0, 500.0, 5000.0)},
+    "null_bias": {"bias": (0.0, 3e-5, 9e-5)},
+    "asymmetric_dead_zone": {"asymmetry": (0.0, 0.1, 0.5)},
+    "null_leakage": {"ratio": (0.0, 0.05, 0.3)},
+    "cross_piston_leakage": {"coefficient": (0.0, 1e-13, 1e-11)},
+    "supply_droop": {"resistance": (0.0, 4.3e8, 1.7e9)},
+    "return_pressure": {"pressure": (0.0, 2e5, 1e6)},
+    "oil_compressibility": {"capacitance": (0.0, 5e-14, 3e-13)},
+    "structural_flexibility": {"stiffness": (np.inf, 1e7, 1e8)},
+    "spool_rate_limit": {"rate": (np.inf, 0.2, 1.0)},
+    "torque_motor_hysteresis": {"width": (0.0, 3e-5, 1.5e-4)},
+    "feedback_backlash": {"width": (0.0, 5e-5, 5e-4)},
+    "transport_delay": {"delay": (0.0, 1e-3, 5e-3)},
+    "sensor_lag": {"time_constant": (0.0, 1e-3, 5e-3)},
+    "sensor_gain": {"error": (0.0, 2e-3, 2e-2)},
+    "sensor_bias": {"bias": (0.0, 1e-4, 1e-3)},
+    "sensor_drift": {"drift": (0.0, 2e-4, 2e-3)},
+    "sensor_saturation": {"limit": (np.inf, 0.03, 0.05)},
+    "sensor_quantisation": {"step": (0.0, 2e-5, 5e-4)},
+    "hardening_spring": {"coefficient": (0.0, 5.6e5, 2.8e6)},
+    "constant_load": {"force": (0.0, 100.0, 3000.0)},
+    "area_asymmetry": {"asymmetry": (0.0, 0.05, 0.5)},
+    "end_stop": {"position": (np.inf, 0.02, 0.04), "stiffness": (0.0, 1e7, 1e8)},
+    "flow_gain_drift": {"drift": (0.0, 0.02, 0.1)},
+    "flow_gain_rounding": {"width": (0.0, 1e-5, 1e-4)},
+    "flow_gain_curvature": {"curvature": (0.0, 0.05, 0.1)},
+    "harmonic_load": {"force": (0.0, 100.0, 1000.0), "frequency": (0.0, 5.0, 60.0), "phase": ANY_PHASE},
+    "unknown_position_dependent_supply": {
+        "depth": (0.0, 0.1, 0.4),
+        "place": (0.0, -0.03, 0.03),
+        "width": (1.0, 5e-3, 0.015),
+    },
+    "unknown_spool_notch": {"depth": (0.0, 0.1, 0.4), "place": (0.0, 5e-4, 2e-3), "width": (1.0, 1e-4, 4e-4)},
+    "unknown_cogging": {"force": (0.0, 300.0, 3000.0), "pitch": (1.0, 5e-3, 2e-2)},
+}
+VAN_DER_POL_EFFECTS = {
+    "cubic_stiffness": {"coefficient": (0.0, 5e-4, 6e-3)},
+    "quintic_stiffness": {"coefficient": (0.0, 1.5e-4, 2e-3)},
+    "quadratic_stiffness": {"coefficient": (0.0, 5e-3, 0.04)},
+    "linear_damping": {"coefficient": (0.0, 0.01, 0.12)},
+    "rayleigh_damping": {"coefficient": (0.0, 1e-3, 0.01)},
+    "quadratic_damping": {"coefficient": (0.0, 2e-3, 0.025)},
+    "coulomb_friction": {"force": (0.0, 0.01, 0.1)},
+    "asymmetric_damping": {"offset": (0.0, 0.01, 0.09)},
+    "damping_threshold": {"threshold": (1.0, 1.01, 1.12)},
+    "constant_force": {"force": (0.0, 0.01, 0.08)},
+    "input_gain": {"error": (0.0, 0.01, 0.1)},
+    "transport_delay": {"delay": (0.0, 0.02, 0.2)},
+    "input_lag": {"time_constant": (0.0, 0.02, 0.25)},
+    "input_dead_zone": {"width": (0.0, 5e-3, 0.05)},
+    "input_saturation": {"limit": (np.inf, 0.75, 0.95)},
+    "parameter_drift": {"drift": (0.0, 0.02, 0.17)},
+    "harmonic_force": {"force": (0.0, 0.02, 0.1), "frequency": (0.0, 0.3, 5.0), "phase": ANY_PHASE},
+    "parametric_excitation": {"depth": (0.0, 0.02, 0.1), "frequency": (0.0, 0.3, 5.0), "phase": ANY_PHASE},
+    "sensor_bias": {"bias": (0.0, 0.02, 0.2)},
+    "sensor_gain": {"error": (0.0, 0.01, 0.1)},
+    "sensor_cubic": {"coefficient": (0.0, 5e-3, 0.05)},
+    "sensor_saturation": {"limit": (np.inf, 1.5, 1.9)},
+    "sensor_lag": {"time_constant": (0.0, 0.02, 0.2)},
+    "process_noise": {"intensity": (0.0, 1e-4, 1e-2), "seed": (0.0, 0.0, 1e6)},
+    "unknown_bump": {"force": (0.0, 0.03, 0.08), "place": (0.0, -1.5, 1.5), "width": (1.0, 0.15, 0.5)},
+    "unknown_step_damping": {"coefficient": (0.0, 0.03, 0.2), "place": (0.0, -1.0, 1.0)},
+}
+EFFECTS = {"servovalve": SERVOVALVE_EFFECTS, "van_der_pol": VAN_DER_POL_EFFECTS}
+
+SERVOVALVE_STEP = 1e-4  # s
+VAN_DER_POL_STEP = 2e-3  # s
+FIRST = 1.0 - math.sqrt(0.5)  # node and diagonal of Alexander's method
+
+
+class Valve(NamedTuple):
+    """The paper's servovalve, SI units."""
+
+    dead_zone: float = 1e-4
+    saturation: float = 3e-3
+    flow_gain: float = 1.45e-4
+    feedback_gain: float = 0.09
+    damping_ratio: float = 0.72
+    natural_frequency: float = 300.0
+    piston_area: float = 25e-4
+    supply_pressure: float = 140e5
+    mass: float = 20.0
+    stiffness: float = 1e4
+
+
+class Load(NamedTuple):
+    """State of the load: position m, velocity m/s, load pressure Pa, each [batch]."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    pressure: np.ndarray
+
+
+def effect_sizes(model_name: str) -> dict[str, dict[str, tuple[float, float]]]:
+    """Plausible (low, high) sizes of each parameter of each effect of "servovalve" or "van_der_pol"."""
+    return {
+        effect: {parameter: (low, high) for parameter, (_, low, high) in parameters.items()}
+        for effect, parameters in EFFECTS[model_name].items()
+    }
+
+
+def held_levels(rng: np.random.Generator, amplitude: float, count: int, samples: int) -> np.ndarray:
+    """Pseudo random signal [count*samples]: `count` levels, uniform in +-amplitude, each held for `samples` samples."""
+    return np.repeat(rng.uniform(-amplitude, amplitude, count), samples)
+
+
+def servovalve_with(
+    effects: Sequence[Mapping[str, Mapping[str, float]]],
+    command: np.ndarray,
+    sample_period: float,
+    *,
+    noise: np.ndarray | None = None,
+    fine_step: float = SERVOVALVE_STEP,
+    **valve: float,
+) -> dict[str, np.ndarray]:
+    """Simulate servovalves from rest over a command [batch, time], m of spool stroke, held between samples.
+
+    Takes one mapping of effects for each record, the parameters of `Valve`, and noise [batch, time], m, to be added
+    to the position before it is quantised. Returns, [batch, time], the measured position m, the spool's displacement
+    before bias and dead zone m, and the load pressure Pa.
+    """
+    if unknown := set(valve) - set(Valve._fields):
+        raise ValueError(f"unknown parameters of the servovalve: {sorted(unknown)}")
+    valve = Valve(**valve)
+    sizes = _sizes_over_batch(effects, SERVOVALVE_EFFECTS)
+    command = _checked_command(command, len(effects))
+    batch, samples = command.shape
+    substeps, step = _substeps(sample_period, fine_step)
+    duration = samples * sample_period
+    delayed = _delayed_command(command, sizes, step, substeps)
+    filter_matrix = _filter_matrix(valve.natural_frequency, valve.damping_ratio, step)
+    rate_limit, flexibility = sizes.get("spool_rate_limit"), sizes.get("structural_flexibility")
+    hysteresis, backlash = sizes.get("torque_motor_hysteresis", 0.0), sizes.get("feedback_backlash", 0.0)
+    lag = sizes.get("sensor_lag")
+
+    load = Load(np.zeros(batch), np.zeros(batch), np.zeros(batch))
+    spool_and_input = np.zeros((4, batch))  # displacement, its rate, error at the start and at the end of the step
+    spool, rate, error, next_error = spool_and_input
+    fed_back, driven, seen, sensed = (np.zeros(batch) for _ in range(4))
+    position, displacement, pressure = np.empty((3, samples, batch))
+    for sample in range(samples):
+        position[sample], displacement[sample], pressure[sample] = sensed, spool, load.pressure
+        for substep, held in enumerate(delayed(sample)):
+            time = sample * sample_period + substep * step
+            expected = load.position + step * load.velocity
+            fed_back = _play(load.position, fed_back, backlash)
+            driven = _play(held - valve.feedback_gain * fed_back, driven, hysteresis)
+            error[:] = driven
+            next_error[:] = _play(held - valve.feedback_gain * _play(expected, fed_back, backlash), driven, hysteresis)
+            spool_between, spool_after, rate_after = filter_matrix @ spool_and_input
+            if rate_limit is not None:
+                excess = rate_after - _clipped(rate_after, -rate_limit, rate_limit)
+                rate_after = rate_after - excess
+                spool_after = spool_after - 0.5 * step * excess
+                spool_between = spool_between - 0.5 * step * FIRST**2 * excess
+            spool[:], rate[:] = spool_after, rate_after
+            load = _load_step(load, spool_between, spool_after, time, step, duration, valve, sizes)
+            previous, seen = seen, load.position
+            if flexibility is not None:
+                seen = seen + valve.piston_area * load.pressure / flexibility
+            sensed = seen if lag is None else _lagged(sensed, previous, seen, lag, step)
+    position = _sensed_position(position.T, np.arange(samples) / samples, sizes)
+    if noise is not None:
+        position = position + np.asarray(noise)
+    if "sensor_quantisation" in sizes:
+        quantum = sizes["sensor_quantisation"][:, None]
+        safe = np.where(quantum > 0, quantum, 1.0)
+        position = np.where(quantum > 0, safe * np.round(position / safe), position)
+    return {"position": position, "spool": displacement.T, "load_pressure": pressure.T}
+
+
+def van_der_pol_with(
+    effects: Sequence[Mapping[str, Mapping[str, float]]],
+    command: np.ndarray,
+    sample_period: float,
+    alpha: float = 0.96,
+    gamma: float = 1.23,
+    initial: Sequence[float] | np.ndarray = (0.0, 0.0),
+    *,
+    fine_step: float = VAN_DER_POL_STEP,
+) -> dict[str, np.ndarray]:
+    """Simulate x1' = alpha*x2, x2' = -x1 + gamma*(1 - x1^2)*x2 + u over a command [batch, time] held between samples.
+
+    Takes one mapping of effects for each record and the initial (x1, x2), [2] or [batch, 2]; process noise of
+    intensity q adds a variance of q*t to x2. Returns the measured position x1 and the velocity x2, [batch, time].
+    """
+    sizes = _sizes_over_batch(effects, VAN_DER_POL_EFFECTS)
+    command = _checked_command(command, len(effects))
+    batch, samples = command.shape
+    substeps, step = _substeps(sample_period, fine_step)
+    duration = samples * sample_period
+    # A static nonlinearity of the input commutes with its delay and with holding it.
+    command = _shaped_input(command, sizes)
+    delayed = _delayed_command(command, sizes, step, substeps)
+    input_lag, sensor_lag = sizes.get("input_lag"), sizes.get("sensor_lag")
+    acceleration = _smooth_acceleration(duration, gamma, sizes)
+    kicks = _process_noise(sizes, samples * substeps, step)
+
+    x1, x2 = np.broadcast_to(np.asarray(initial, dtype=float), (batch, 2)).T.copy()
+    lagged, sensed = np.zeros(batch), x1
+    position, velocity = np.empty((2, samples, batch))
+    for sample in range(samples):
+        position[sample], velocity[sample] = sensed, x2
+        for substep, held in enumerate(delayed(sample)):
+            time = sample * sample_period + substep * step
+            inputs = (held, held, held)
+            if input_lag is not None:
+                start = np.where(input_lag > 0, lagged, held)
+                inputs = (start, *(held + (start - held) * _decay(t, input_lag) for t in (0.5 * step, step)))
+                lagged = inputs[2]
+            before = x1
+            x1, x2 = _van_der_pol_step(x1, x2, time, step, inputs, acceleration, alpha, sizes)
+            if kicks is not None:
+                x2 = x2 + kicks[sample * substeps + substep]
+            sensed = x1 if sensor_lag is None else _lagged(sensed, before, x1, sensor_lag, step)
+    position = _sensed_position(position.T, np.arange(samples) / samples, sizes)
+    return {"position": position, "velocity": velocity.T}
+
+
+def _sizes_over_batch(effects, known):
+    """Size [batch], or a tuple of sizes, of each effect that any record has; absent values in the other records."""
+    for mapping in effects:
+        for effect, parameters in mapping.items():
+            if effect not in known:
+                raise ValueError(f"unknown effect {effect!r}; there are {sorted(known)}")
+            if set(parameters) != set(known[effect]):
+                raise ValueError(f"{effect} has the parameters {sorted(known[effect])}, not {sorted(parameters)}")
+    sizes = {}
+    for effect in {effect: None for mapping in effects for effect in mapping}:
+        arrays = [
+            np.array([float(mapping[effect][parameter]) if effect in mapping else absent for mapping in effects])
+            for parameter, (absent, _, _) in known[effect].items()
+        ]
+        sizes[effect] = arrays[0] if len(arrays) == 1 else tuple(arrays)
+    return sizes
+
+
+def _checked_command(command, batch):
+    command = np.asarray(command, dtype=float)
+    if command.ndim != 2 or len(command) != batch:
+        raise ValueError(f"the command must be [batch, time] with {batch} records, not of shape {command.shape}")
+    return command
+
+
+def _substeps(sample_period, fine_step):
+    count = max(1, round(sample_period / fine_step))
+    return count, sample_period / count
+
+
+def _delayed_command(command, sizes, step, substeps):
+    """Return commands(sample), [substep, batch]: the delayed command's mean over each fine step of that sample.
+
+    The mean in the one step that holds a jump keeps second order: it is right but for the second moment in time.
+    """
+    records = len(command)
+    delay = sizes.get("transport_delay", np.zeros(records))
+    # A delay of whole samples must not be off by one sample because of rounding.
+    whole = np.floor(delay / (step * substeps) + 1e-9).astype(int)
+    part = np.maximum(delay / step - whole * substeps, 0.0)
+    weight = np.clip(np.arange(1, substeps + 1)[:, None] - part, 0.0, 1.0)
+    padded = np.concatenate([np.zeros((records, 1)), command], axis=1).T
+    lanes = np.arange(records)
+
+    def commands(sample):
+        new = padded[np.maximum(sample + 1 - whole, 0), lanes]
+        old = padded[np.maximum(sample - whole, 0), lanes]
+        return old * (1.0 - weight) + new * weight
+
+    return commands
+
+
+def _filter_matrix(omega, damping, step):
+    """From (p, p', input at the start, input at the end) to p at the inner stage, p and p' at the end, [3, 4]."""
+    dynamics = np.zeros((4, 4))  # of p, p', the input and its slope
+    dynamics[0, 1] = dynamics[2, 3] = 1.0
+    dynamics[1, :3] = -(omega**2), -2.0 * damping * omega, omega**2
+    slope = np.eye(4)
+    slope[3, 2:] = -1.0 / step, 1.0 / step
+    inner, full = (_exponential(dynamics * t) @ slope for t in (FIRST * step, step))
+    return np.stack([inner[0], full[0], full[1]])
+
+
+def _exponential(matrix):
+    """Exponential of a matrix, by its series after halving it to a norm below one half, and squaring back."""
+    halvings = max(0, math.ceil(math.log2(2.0 * np.abs(matrix).sum(axis=1).max() + 1e-300)))
+    term = total = np.eye(len(matrix))
+    for order in range(1, 20):
+        term = term @ matrix / (order * 2.0**halvings)
+        total = total + term
+    return np.linalg.matrix_power(total, 2**halvings)
+
+
+def _clipped(value, low, high):
+    return np.minimum(np.maximum(value, low), high)  # np.clip costs several times more on short arrays
+
+
+def _play(value, output, width):
+    """Play operator: the output is dragged along so that it stays within +-width of the value."""
+    return _clipped(output, value - width, value + width)
+
+
+def _decay(time, time_constant):
+    """exp(-time/time_constant), and 0 where there is no lag."""
+    return np.where(time_constant > 0, np.exp(-time / np.where(time_constant > 0, time_constant, 1.0)), 0.0)
+
+
+def _lagged(output, start, end, time_constant, step):
+    """First-order lag of a signal that is linear over the step from start to end."""
+    decay = _decay(step, time_constant)
+    return end - (end - start) * (time_constant / step) * (1.0 - decay) + (output - start) * decay
+
+
+def _gaussian(value, place, width):
+    return np.exp(-0.5 * ((value - place) / width) ** 2)
+
+
+def _opening(spool, valve, sizes):
+    """Opening [batch], m: dead zone, then saturation."""
+    spool = spool - sizes.get("null_bias", 0.0)
+    asymmetry = sizes.get("asymmetric_dead_zone", 0.0)
+    low, high = -valve.dead_zone * (1.0 - asymmetry), valve.dead_zone * (1.0 + asymmetry)
+    inside = _clipped(spool, low, high)
+    opening = spool - inside
+    if "flow_gain_rounding" in sizes:
+        width = sizes["flow_gain_rounding"]
+        safe = np.where(width > 0, width, 1.0)
+        rounded = safe * (np.logaddexp(0.0, (spool - high) / safe) - np.logaddexp(0.0, (low - spool) / safe))
+        opening = np.where(width > 0, rounded, opening)
+    opening = opening + sizes.get("null_leakage", 0.0) * inside
+    return _clipped(opening, -valve.saturation, valve.saturation)
+
+
+def _conductance(opening, time, duration, valve, sizes):
+    """Flow per root of pressure [batch], m^3/(s Pa^0.5), not negative."""
+    conductance = valve.flow_gain * np.abs(opening)
+    if "flow_gain_drift" in sizes:
+        conductance = conductance * (1.0 + sizes["flow_gain_drift"] * (time / duration))
+    if "flow_gain_curvature" in sizes:
+        conductance = conductance * (1.0 + sizes["flow_gain_curvature"] * (opening / valve.saturation) ** 2)
+    if "unknown_spool_notch" in sizes:
+        depth, place, width = sizes["unknown_spool_notch"]
+        conductance = conductance * (1.0 - depth * _gaussian(opening, place, width))
+    return conductance
+
+
+def _external_force(x, time, valve, sizes):
+    """Force [batch], N, against positive motion at the position x, and the stiffness N/m; force = stiffness*x + it."""
+    force, stiffness = sizes.get("constant_load", 0.0), valve.stiffness
+    if "hardening_spring" in sizes:
+        force = force + sizes["hardening_spring"] * x * x * x
+    if "harmonic_load" in sizes:
+        amplitude, frequency, phase = sizes["harmonic_load"]
+        force = force + amplitude * np.sin(frequency * time + phase)
+    if "unknown_cogging" in sizes:
+        amplitude, pitch = sizes["unknown_cogging"]
+        force = force + amplitude * np.sin(2.0 * math.pi * x / pitch)
+    if "end_stop" in sizes:
+        place, stop = sizes["end_stop"]
+        stop = np.where(x > place, stop, 0.0)
+        stiffness = stiffness + stop
+        force = force - stop * np.where(stop > 0, place, 0.0)
+    return force, stiffness
+
+
+def _load_step(load, spool_between, spool_after, time, step, duration, valve, sizes):
+    """One step of Alexander's method for position, velocity and load pressure."""
+    part = FIRST * step
+    between = _load_stage(load, load.velocity, spool_between, time + part, part, duration, valve, sizes)
+    # Where the second stage starts: the state plus (1 - FIRST)*step times its rates in the first stage.
+    share = (1.0 - FIRST) / FIRST
+    start = Load(*(old + share * (new - old) for old, new in zip(load, between, strict=True)))
+    return _load_stage(start, between.velocity, spool_after, time + step, part, duration, valve, sizes)
+
+
+def _load_stage(start, velocity, spool, time, step, duration, valve, sizes):
+    """Backward Euler over `step` from a start; `velocity` is the one expected.
+
+    What the closed form leaves to the expected velocity changes little with it, and two passes settle it. Stribeck's
+    friction together with compressibility hunts, though: that record repeats only to about 1e-4 m.
+    """
+    opening = _opening(spool, valve, sizes)
+    conductance = _conductance(opening, time, duration, valve, sizes)
+    for _ in range(2 if "stribeck_friction" in sizes or "supply_droop" in sizes else 1):
+        found = _balanced(start, velocity, opening, conductance, time, step, valve, sizes)
+        velocity = found.velocity
+    return found
+
+
+def _balanced(start, velocity, opening, conductance, time, step, valve, sizes):
+    """Solve a stage's balances of flow and force, with sticking exact, for everything else at the expected velocity.
+
+    With s the sign of the opening and w the signed root of s*Ps - P,
+        A*V + Ct*P + C*(P - P_start)/step = G*w,    P = s*Ps - w*|w|,
+        M*(V - V_start)/step = A*P - K*X - B*V - F - friction.
+    """
+    x = start.position + step * velocity
+    area = valve.piston_area
+    backward = area * (1.0 - sizes.get("area_asymmetry", 0.0))
+    supply = valve.supply_pressure - sizes.get("return_pressure", 0.0)
+    if "supply_droop" in sizes:
+        supply = supply - sizes["supply_droop"] * np.abs(velocity) * np.where(velocity < 0, backward, area)
+    if "unknown_position_dependent_supply" in sizes:
+        depth, place, width = sizes["unknown_position_dependent_supply"]
+        supply = supply - valve.supply_pressure * depth * _gaussian(x, place, width)
+    blocked = np.sign(opening) * supply  # load pressure without any flow
+    mobility = step / valve.mass
+    force, stiffness = _external_force(x, time, valve, sizes)
+    inertia = 1.0 + mobility * (step * stiffness + sizes.get("viscous_friction", 0.0))
+    momentum = start.velocity - mobility * (stiffness * start.position + force)
+
+    loss, lost, resting = 0.0, 0.0, blocked  # load pressure at rest, which is all of it without leakage
+    if "cross_piston_leakage" in sizes or "oil_compressibility" in sizes:
+        storage = sizes.get("oil_compressibility", 0.0) / step
+        loss = sizes.get("cross_piston_leakage", 0.0) + storage
+        lost = loss * blocked - storage * start.pressure
+        root = 2.0 * lost / (conductance + np.sqrt(conductance**2 + 4.0 * loss * np.abs(lost)) + 1e-300)
+        resting = blocked - root * np.abs(root)
+    if "area_asymmetry" in sizes:
+        guess = np.where(opening < 0, backward, area)
+        area = np.where(momentum + mobility * guess * resting < 0, backward, area)
+    push = mobility * area
+    friction, held = sizes.get("coulomb_friction"), 0.0
+    if "stribeck_friction" in sizes:
+        extra, fade = sizes["stribeck_friction"]
+        friction = (0.0 if friction is None else friction) + extra * np.exp(-((velocity / fade) ** 2))
+    if friction is not None:
+        unbalanced = momentum + push * resting
+        held = _clipped(unbalanced, -mobility * friction, mobility * friction)
+    ratio = inertia / area
+    quadratic, linear = push + ratio * loss, ratio * conductance
+    constant = momentum - held + push * blocked + ratio * lost
+    w = 2.0 * constant / (linear + np.sqrt(linear**2 + 4.0 * quadratic * np.abs(constant)) + 1e-300)
+    square = w * np.abs(w)
+    velocity = (conductance * w + loss * square - lost) / area
+    if friction is not None:
+        velocity = np.where((held == unbalanced) & (friction > 0), 0.0, velocity)
+    position = start.position + step * velocity
+    # A valve that closed during the step has stopped the load: what is left is the static balance.
+    pressure = np.where(conductance + loss > 0, blocked - square, (stiffness * position + force) / area)
+    return Load(position, velocity, pressure)
+
+
+def _sensed_position(position, fraction, sizes):
+    """Static part of the sensor, on positions [batch, time] at fractions [time] of the record."""
+
+    def size(effect, absent=0.0):
+        return sizes.get(effect, np.full(1, absent))[:, None]
+
+    position = position + size("sensor_cubic") * position**3
+    position = (1.0 + size("sensor_gain")) * position + size("sensor_bias") + size("sensor_drift") * fraction
+    limit = size("sensor_saturation", np.inf)
+    return _clipped(position, -limit, limit)
+
+
+def _shaped_input(command, sizes):
+    """Gain, dead zone and saturation of the input, in this order, on [batch, time]."""
+
+    def size(effect, absent=0.0):
+        return sizes.get(effect, np.full(1, absent))[:, None]
+
+    command = command * (1.0 + size("input_gain"))
+    command = command - _clipped(command, -size("input_dead_zone"), size("input_dead_zone"))
+    return _clipped(command, -size("input_saturation", np.inf), size("input_saturation", np.inf))
+
+
+def _process_noise(sizes, steps, step):
+    """Increments of x2, [step, batch], or None."""
+    if "process_noise" not in sizes:
+        return None
+    intensity, seeds = sizes["process_noise"]
+    draws = [np.random.default_rng(seed).standard_normal(steps) for seed in seeds.astype(int)]
+    return np.sqrt(intensity * step) * np.stack(draws, axis=1)
+
+
+def _smooth_acceleration(duration, gamma, sizes):
+    """Return acceleration(x1, x2, time, input) of the oscillator, [batch], without the laws that jump."""
+    get = sizes.get
+    offset, threshold = get("asymmetric_damping", 0.0), get("damping_threshold", 1.0)
+    drift, linear, constant = get("parameter_drift", 0.0), get("linear_damping", 0.0), get("constant_force", 0.0)
+    powers = [
+        (get(effect + "_stiffness"), power)
+        for effect, power in (("quadratic", 2), ("cubic", 3), ("quintic", 5))
+        if effect + "_stiffness" in sizes
+    ]
+
+    def acceleration(x1, x2, time, u):
+        damping = gamma * (1.0 + drift * (time / duration)) * (1.0 - ((x1 - offset) / threshold) ** 2) - linear
+        if "rayleigh_damping" in sizes:
+            damping = damping - sizes["rayleigh_damping"] * x2 * x2
+        if "quadratic_damping" in sizes:
+            damping = damping - sizes["quadratic_damping"] * np.abs(x2)
+        force = u + constant - x1
+        for coefficient, power in powers:
+            force = force - coefficient * x1**power
+        if "harmonic_force" in sizes:
+            amplitude, frequency, phase = sizes["harmonic_force"]
+            force = force + amplitude * np.cos(frequency * time + phase)
+        if "parametric_excitation" in sizes:
+            depth, frequency, phase = sizes["parametric_excitation"]
+            force = force - depth * np.cos(frequency * time + phase) * x1
+        if "unknown_bump" in sizes:
+            amplitude, place, width = sizes["unknown_bump"]
+            force = force + amplitude * _gaussian(x1, place, width)
+        return force + damping * x2
+
+    return acceleration
+
+
+def _van_der_pol_step(x1, x2, time, step, inputs, acceleration, alpha, sizes):
+    """One Runge-Kutta step of fourth order; the inputs are those at its start, middle and end.
+
+    Laws that jump are replaced by their mean over the step, from the expected time of the jump: second order.
+    """
+    middle, half = time + 0.5 * step, 0.5 * step
+    first = acceleration(x1, x2, time, inputs[0])
+    damping = held = 0.0
+    if "unknown_step_damping" in sizes:
+        coefficient, place = sizes["unknown_step_damping"]
+        start, end = x1 - place, x1 + alpha * step * (x2 + 0.5 * step * first) - place
+        high = np.maximum(start, end)
+        damping = coefficient * _clipped(high / np.maximum(high - np.minimum(start, end), 1e-300), 0.0, 1.0)
+    if "coulomb_friction" in sizes:
+        friction, drive = sizes["coulomb_friction"], first - damping * x2
+        v2 = x2 + half * (drive - friction * np.sign(x2))
+        change = acceleration(x1 + half * alpha * x2, v2, middle, inputs[1]) - damping * v2 - drive
+        sign, sticks, rest = _friction_over_step(x2, drive, change / half, friction, step)
+        held = friction * sign
+    a1 = first - damping * x2 - held
+    v2 = x2 + half * a1
+    a2 = acceleration(x1 + half * alpha * x2, v2, middle, inputs[1]) - damping * v2 - held
+    v3 = x2 + half * a2
+    a3 = acceleration(x1 + half * alpha * v2, v3, middle, inputs[1]) - damping * v3 - held
+    v4 = x2 + step * a3
+    a4 = acceleration(x1 + step * alpha * v3, v4, time + step, inputs[2]) - damping * v4 - held
+    position = x1 + alpha * step / 6.0 * (x2 + 2.0 * v2 + 2.0 * v3 + v4)
+    velocity = x2 + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+    if "coulomb_friction" in sizes:
+        position = np.where(sticks, x1 + 0.5 * alpha * x2 * rest, position)
+        velocity = np.where(sticks, 0.0, velocity)
+    return position, velocity
+
+
+def _friction_over_step(velocity, drive, drive_rate, friction, step):
+    """Mean sign of the velocity over a step, whether it ends at rest, and the time until rest s, each [batch]."""
+    direction = np.where(velocity != 0, np.sign(velocity), np.sign(drive))
+    rest = 0.0
+    for _ in range(3):
+        slowing = friction * np.abs(direction) - direction * (drive + 0.5 * drive_rate * rest)
+        rest = np.minimum(np.abs(velocity) / np.where(slowing > 0, slowing, 1e-300), step)
+    drive = drive + drive_rate * rest
+    sticks = (friction > 0) & (rest < step) & (np.abs(drive) < friction)
+    return (direction * rest + np.sign(drive) * (step - rest)) / step, sticks, rest
