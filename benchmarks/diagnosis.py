@@ -2,11 +2,11 @@
 
     python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all] [--seed 0]
 
-The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each kind
-at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an effect
-that the bank does not have. For one effect the plant also says what could be known: the noise variances by which the
-best rival would fit worse, to first order, the nominal parameters refitted. Draws are shared out to processes, one on
-each core; each trial can be repeated from its seed.
+The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
+kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an
+effect that the bank does not have. For one effect the plant also says what could be known: the noise variances by which
+the best rival would fit worse, to first order, the nominal parameters refitted. Draws are shared out to processes, one
+on each core; each trial can be repeated from its seed.
 """
 
 import argparse
@@ -42,11 +42,13 @@ VARIANCES = {"servovalve": (1e-8, 1e-7, 1e-5), "van_der_pol": (0.001, 0.01, 0.05
 EXCITATIONS = 3
 # Sizes of these are never negative.
 ONE_SIDED = frozenset(
-    """coulomb_friction stribeck_friction viscous_friction null_leakage cross_piston_leakage supply_droop return_pressure
+    """
+    coulomb_friction stribeck_friction viscous_friction null_leakage cross_piston_leakage supply_droop return_pressure
     oil_compressibility structural_flexibility spool_rate_limit torque_motor_hysteresis feedback_backlash
     transport_delay sensor_lag sensor_saturation sensor_quantisation end_stop flow_gain_rounding harmonic_load
     damping_threshold input_lag input_dead_zone input_saturation harmonic_force parametric_excitation process_noise
-    unknown_position_dependent_supply unknown_spool_notch unknown_cogging""".split()  # noqa: SIM905
+    unknown_position_dependent_supply unknown_spool_notch unknown_cogging
+    """.split()  # noqa: SIM905
 )
 
 
@@ -207,7 +209,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
             )
             identified = time.perf_counter()
             d = diagnose(fit, record, key=jax.random.key(trial.seed))
-        except Exception:  # noqa: BLE001 a failure is a result, and the others go on
+        except Exception:  # a failure is a result, and the others go on
             rows.append(row | {"verdict": "failed", "error": traceback.format_exc(limit=-4)})
             continue
         gain = d.gain.outputs["position"]

@@ -36,8 +36,8 @@ class Diagnosis:
         verdict: "adequate", "named", "ambiguous" or "unexplained".
         causes: names of the effects that are missing in the model, best first; empty unless named or ambiguous.
         alternatives: for each cause that is not alone: all that could be there instead, itself among them.
-        table: every candidate: signal, size, unit, score, p-values, likelihood gain, smallest size that the record could
-            have shown, and what it is confounded with.
+        table: every candidate: signal, size, unit, score, p-values, likelihood gain, smallest size that the record
+            could have shown, and what it is confounded with.
         extended: the fit of the extended model; the refitted nominal one where nothing was found.
         gain: on data that were not used for fitting.
         misfit: what the nominal model gets wrong.

@@ -100,17 +100,23 @@ def _gain(before, after, readings, noise_variance, rng) -> OutputGain:
     squares = np.stack([before**2, after**2], axis=1)
     mean = squares.mean(axis=0)
     removable = mean[0] - noise_variance
-    share, interval = float("nan"), (float("nan"), float("nan"))
+    share, low, high = (float("nan"),) * 3
     # A removable error within what noise does to a mean square is none.
     if removable > 4.0 * noise_variance * np.sqrt(2.0 / len(before)):
         share = float((mean[0] - mean[1]) / removable)
         drawn = _redrawn(squares, rng)
         shares = (drawn[:, 0] - drawn[:, 1]) / np.maximum(drawn[:, 0] - noise_variance, 1e-300)
-        interval = tuple(float(q) for q in np.quantile(shares, [0.025, 0.975]))
-    fits = 100.0 * (1.0 - np.sqrt(mean / about_mean))
+        low, high = (float(q) for q in np.quantile(shares, [0.025, 0.975]))
+    rmse, fits = np.sqrt(mean), 100.0 * (1.0 - np.sqrt(mean / about_mean))
     return OutputGain(
-        *(float(v) for v in np.sqrt(mean)), *(float(v) for v in fits), noise_variance**0.5, share, interval
-    )  # fmt: skip
+        rmse_before=float(rmse[0]),
+        rmse_after=float(rmse[1]),
+        fit_before=float(fits[0]),
+        fit_after=float(fits[1]),
+        noise_floor=noise_variance**0.5,
+        share_removed=share,
+        share_interval=(low, high),
+    )
 
 
 def _redrawn(squares: Float[np.ndarray, "sample model"], rng) -> Float[np.ndarray, "draw model"]:

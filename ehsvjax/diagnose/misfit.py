@@ -15,7 +15,7 @@ _WINDOWS = 20
 
 
 class Profile(NamedTuple):
-    """Mean residual by a quantity: `[bin]` its middle, the mean, and the mean's standard deviation under noise alone."""
+    """Mean residual by a quantity: `[bin]` its middle, the mean, and the mean's deviation under noise alone."""
 
     middle: Float[np.ndarray, " bin"]
     mean: Float[np.ndarray, " bin"]

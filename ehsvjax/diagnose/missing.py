@@ -1,7 +1,7 @@
 """What acts where, without a form assumed: missing terms at a signal as functions of what runs along the model.
 
-At a place (a force, an opening, a sensor) a term is added that depends on one quantity (velocity, position, spool, time,
-...) by a curve of straight pieces. The responses of the outputs to each piece are simulated. If the residual has
+At a place (a force, an opening, a sensor) a term is added that depends on one quantity (velocity, position, spool,
+time, ...) by a curve of straight pieces. The responses of the outputs to each piece are simulated. If the residual has
 nothing to do with any of them, it is innocent: what is left does not depend on the input. If it has, the curve itself
 is estimated, with its band.
 """
@@ -14,7 +14,7 @@ from jaxtyping import Float
 from scipy import stats
 
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits
+from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.screening import complement
 from ehsvjax.diagnose.workbench import Workbench
 
@@ -22,6 +22,9 @@ _COARSE = 8
 _FINE = (8, 14, 24, 40)
 _DRAWS = 20_000
 _PROBE = 1e-3
+# Steps of the estimate of a curve, and shares of each step that are simulated.
+_STEPS = 8
+_SHARES = (1.0, 0.5, 0.2, 0.05)
 TIME = "time"
 
 
@@ -147,10 +150,10 @@ def dependences(
     null.sort()
     found = []
     for curve, q, statistic, p in zip(curves, bases, statistics, p_values, strict=True):
-        corrected = np.searchsorted(null, p, side="right") / _DRAWS
+        corrected = float(np.searchsorted(null, p, side="right")) / _DRAWS
         if corrected < 20 / _DRAWS:
             corrected = min(20 / _DRAWS, len(curves) * p)
-        found.append(Dependence(curve.place, curve.quantity, p, float(corrected), statistic - q.shape[1]))
+        found.append(Dependence(curve.place, curve.quantity, p, corrected, statistic - q.shape[1]))
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
 
 
@@ -161,30 +164,35 @@ def missing_term(
     seen: Mapping[str, Float[np.ndarray, " time"]],
     suspects: Sequence[Dependence],
 ) -> MissingTerm:
-    """Estimate the term that takes most of what is left, with as many pieces as it deserves (Bayes criterion)."""
+    """Estimate the term that takes most of what is left, with as many pieces as it deserves (Bayes criterion).
+
+    Each suspect is estimated, put into the simulation, and estimated again, for a large term is not linear: the one
+    that then leaves least is it.
+    """
     known, r = _unexplained(final, white)
-    best = None
-    for suspect in suspects:
-        for pieces in _FINE:
-            curve = next(c for c in _curves(bench, suspect.place, seen, pieces) if c.quantity == suspect.quantity)
-            responses = white(_responses(bench, final.points[0], [curve]))
-            outside = responses - (responses @ known) @ known.T
-            coefficients, covariance = _least_squares(outside, r)
-            left = float(np.sum((r - coefficients @ outside) ** 2))
-            criterion = left + len(coefficients) * np.log(len(r))
-            if best is None or criterion < best[0]:
-                best = (criterion, left, curve, coefficients, covariance)
+    attempts = [
+        _settled(bench, final, white, _curve(bench, suspect.place, suspect.quantity, seen, _FINE[0]))
+        for suspect in suspects
+    ]
+    place, quantity = min(attempts, key=lambda a: a.left).curve[:2]
+    best: _Attempt | None = None
+    for pieces in _FINE:
+        attempt = _settled(bench, final, white, _curve(bench, place, quantity, seen, pieces))
+        if best is None or attempt.left + len(attempt.coefficients) * np.log(len(r)) < best.left + len(
+            best.coefficients
+        ) * np.log(len(r)):
+            best = attempt
     assert best is not None
-    _, left, curve, coefficients, covariance = best
-    probe = _probe(bench, curve.place)
-    estimate, deviation = coefficients * probe, np.sqrt(np.maximum(np.diag(covariance), 0.0)) * probe
+    curve = best.curve
+    probe = _probe(bench, place)
+    estimate, deviation = best.coefficients * probe, np.sqrt(np.maximum(np.diag(best.covariance), 0.0)) * probe
     excess = float(r @ r) - (len(r) - known.shape[1])
-    taken = float(r @ r) - left - len(coefficients)
+    taken = float(r @ r) - best.left - len(estimate)
     return MissingTerm(
-        place=curve.place,
-        unit="" if curve.relative else _unit(bench, curve.place),
-        quantity=curve.quantity,
-        quantity_unit=_quantity_unit(bench, curve.quantity),
+        place=place,
+        unit="" if curve.relative else _unit(bench, place),
+        quantity=quantity,
+        quantity_unit=_quantity_unit(bench, quantity),
         at=curve.knots,
         estimate=estimate,
         deviation=deviation,
@@ -192,6 +200,62 @@ def missing_term(
         relative=curve.relative,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
     )
+
+
+class _Attempt(NamedTuple):
+    """A curve with its coefficients, in probes, their covariance, and the sum of squares that it leaves."""
+
+    curve: _Curve
+    coefficients: Float[np.ndarray, " piece"]
+    covariance: Float[np.ndarray, "piece piece"]
+    left: float
+
+
+def _settled(bench: Workbench, final: Refits, white: Whitening, curve: _Curve) -> _Attempt:
+    """Estimate a curve together with the refitted unknowns, by steps that are simulated before they are taken."""
+    samples = bench.problem.samples
+    own = np.flatnonzero(final.chosen[0] >= 0)
+    columns = final.chosen[0][own]
+    rows = np.concatenate([white(final.slopes[0][own]), white(_responses(bench, final.points[0], [curve]))])
+    lower, upper = bounds_of(bench)
+    point, coefficients = final.points[0].copy(), np.zeros(len(curve.pieces))
+    r = white(final.residual[0])
+    left, covariance = float(r @ r), np.zeros((len(curve.pieces),) * 2)
+    for _ in range(_STEPS):
+        step, whole = _least_squares(rows, r)
+        covariance = whole[len(own) :, len(own) :]
+        points, curves = [], []
+        for share in _SHARES:
+            moved = point.copy()
+            moved[columns] = np.clip(point[columns] + share * step[: len(own)], lower[columns], upper[columns])
+            points.append(moved)
+            curves.append(coefficients + share * step[len(own) :])
+        outputs = _with_curve(bench, np.stack(points), np.stack(curves), curve)
+        residuals = white(samples.outputs - outputs)
+        costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
+        best = int(np.argmin(costs))
+        if not costs[best] < left - 0.1:
+            break
+        point, coefficients, r, left = points[best], curves[best], residuals[best], float(costs[best])
+    return _Attempt(curve, coefficients, covariance, left)
+
+
+def _with_curve(bench: Workbench, points, coefficients, curve: _Curve):
+    """Return the outputs of points with a curve acting at its place."""
+    shape = bench.problem.samples.outputs.shape
+    series = _probe(bench, curve.place) * (coefficients @ curve.pieces)
+    if curve.place not in bench.places:
+        outputs = bench.simulated(points)
+        outputs[:, 0, :, bench.problem.observed.index(curve.place)] += series
+        return outputs
+    added = np.zeros((len(points), *shape[:2], len(bench.places)))
+    size = bench.internal.values[curve.place] if curve.relative else 1.0
+    added[:, 0, :, bench.places.index(curve.place)] = series * size
+    return bench.simulated(points, added)
+
+
+def _curve(bench, place, quantity, seen, pieces) -> _Curve:
+    return next(c for c in _curves(bench, place, seen, pieces) if c.quantity == quantity)
 
 
 def _places(bench: Workbench) -> tuple[str, ...]:

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.linalg import toeplitz
 
 from ehsvjax.precision.residual_noise import (
-    SUSPICION,
     ResidualNoise,
     absorbed_by_the_fit,
     meat,
@@ -44,6 +44,9 @@ class Whitening(NamedTuple):
             whitened = series[..., i].astype(float, copy=True)
             for lag, coefficient in enumerate(noise.coefficients, start=1):
                 whitened[..., lag:] -= coefficient * series[..., :-lag, i]
+            order = len(noise.coefficients)
+            if order:
+                whitened[..., :order] = series[..., :order, i] @ _first_innovations(noise).T
             parts.append(whitened[..., self.used[..., i]] / np.sqrt(noise.innovation_variance))
         return np.concatenate(parts, axis=-1)
 
@@ -53,6 +56,14 @@ class Whitening(NamedTuple):
         return any(len(noise.coefficients) for noise in self.noises)
 
 
+def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample"]:
+    """Return what makes the first samples of an autoregression, which none come before, white like the others."""
+    order = len(noise.coefficients)
+    covariance = np.real(np.fft.ifft(noise.spectrum(8192)))[:order]
+    root = np.linalg.cholesky(toeplitz(covariance) + 1e-12 * covariance[0] * np.eye(order))
+    return np.sqrt(noise.innovation_variance) * np.linalg.inv(root)
+
+
 def whitening(noises: Sequence[ResidualNoise], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
     """Return the whitening of noises for what is measured: a sample needs those before it."""
     used = measured.copy()
@@ -60,7 +71,8 @@ def whitening(noises: Sequence[ResidualNoise], measured: Bool[np.ndarray, "recor
         order = len(noise.coefficients)
         for lag in range(1, order + 1):
             used[:, lag:, i] &= measured[:, :-lag, i]
-        used[:, :order, i] = False
+        # The first samples are made white together.
+        used[:, :order, i] &= measured[:, :order, i].all(axis=1, keepdims=True)
     return Whitening(tuple(noises), used)
 
 
@@ -89,12 +101,12 @@ def noise_outside(
     # What the projection took of the noise depends on the noise: three rounds settle it.
     for _ in range(4):
         found = []
-        inside = None if noises is None else sum(
-            meat(basis[..., i], noise) for i, noise in enumerate(noises)
-        )  # fmt: skip
+        inside = None
+        if noises is not None:
+            inside = np.sum([meat(basis[..., i], noise) for i, noise in enumerate(noises)], axis=0)
         for i in range(residual.shape[-1]):
             absorbed = None
-            if noises is not None:
+            if noises is not None and inside is not None:
                 absorbed = absorbed_by_the_fit(
                     basis[..., i], measured[..., i], noises[i], np.eye(basis.shape[-2]), inside
                 )
@@ -181,6 +193,3 @@ def lattice(values: Float[np.ndarray, " time"]) -> float | None:
     step = float(np.sum(gaps) / np.sum(np.round(multiples)))
     off = np.abs(gaps / step - np.round(gaps / step))
     return step if np.max(off) < 1e-3 * np.max(multiples) + 1e-3 else None
-
-
-__all__ = ["SUSPICION", "Whitening", "lattice", "noise_outside", "spikes", "whitening"]

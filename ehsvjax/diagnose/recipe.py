@@ -16,7 +16,8 @@ from ehsvjax.diagnose.misfit import Misfit, misfit_of
 from ehsvjax.diagnose.missing import Dependence, dependences, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside, spikes
 from ehsvjax.diagnose.process_noise import CONVINCING, process_noise
-from ehsvjax.diagnose.selection import SIGNIFICANT, Selection, candidate_numbers, required_gain, select
+from ehsvjax.diagnose.refits import Refits, padded, refit
+from ehsvjax.diagnose.selection import SIGNIFICANT, Selection, candidate_numbers, plain_noise, required_gain, select
 from ehsvjax.diagnose.workbench import Workbench, workbench
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import UNLIMITED, Effect
@@ -28,6 +29,8 @@ from ehsvjax.record import Record
 
 QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"
+# Dependences that are followed up where something is left.
+_SUSPECTS = 8
 # Power of a test at the smallest size that is said to have shown: 95%.
 _POWER_QUANTILE = 1.6449
 # Response of a candidate and of another that are called alike.
@@ -79,9 +82,12 @@ def diagnose(
     verdict, causes, alternatives = _verdict(selection, misfit, innocent, shaken)
     missing = None
     if not innocent and verdict != "named":
-        missing = missing_term(selection.bench, selection.final, selection.white, selection.seen, after[:3])
+        missing = missing_term(selection.bench, selection.final, selection.white, selection.seen, after[:_SUSPECTS])
     say("measuring the gain")
-    nominal, wider = _nominal_fit(selection, record), _extended_fit(selection, record)
+    nominal, wider = (
+        _as_fit(selection, _ordinary(selection, refits, included), included, record)
+        for refits, included in ((selection.nominal, ()), (selection.final, selection.included))
+    )
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key) if _typed(key) else key).tolist())
     gain = gain_of(selection, nominal, wider, validation, rng)
     if verdict == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
@@ -226,56 +232,55 @@ def _values(bench: Workbench, point):
     return parameters, initial
 
 
-def _nominal_fit(selection: Selection, record: Record) -> Fit:
-    parameters, initial = _values(selection.bench, selection.nominal.points[0])
-    return replace(
-        selection.bench.fit,
-        records=(record,),
-        parameters=parameters,
-        initial=(initial,),
-        noise_variance=_variances(selection, selection.nominal.residual),
-    )
+def _ordinary(selection: Selection, refits: Refits, included: tuple[int, ...]) -> Refits:
+    """Return a refit by least squares, as `identify` fits, which coloured noise does not weight."""
+    if not selection.white.coloured:
+        return refits
+    bench = selection.bench
+    white = plain_noise(bench, np.array(list(_variances(selection, refits).values())))
+    own = [j for i in included for j in bench.columns_of(bench.candidates[i])]
+    columns = padded([[*bench.base_columns, *own]], refits.chosen.shape[1])
+    return refit(bench, refits.points, columns, white)
 
 
-def _variances(selection: Selection, residual) -> dict[str, float]:
+def _variances(selection: Selection, refits: Refits) -> dict[str, float]:
     problem = selection.bench.problem
     return {
-        name: float(np.mean(residual[0][..., i][problem.samples.measured[..., i]] ** 2))
+        name: float(np.mean(refits.residual[0][..., i][problem.samples.measured[..., i]] ** 2))
         for i, name in enumerate(problem.observed)
     }
 
 
-def _extended_fit(selection: Selection, record: Record) -> Fit:
-    """Return the fit of the model with the effects found, an ordinary fit of an ordinary model."""
+def _as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], record: Record) -> Fit:
+    """Return a refit as an ordinary fit, of the nominal model or of the model with the effects found."""
     bench = selection.bench
-    if not selection.included:
-        return _nominal_fit(selection, record)
-    parameters, initial = _values(bench, selection.final.points[0])
-    attached = tuple(bench.candidates[i] for i in selection.included)
+    parameters, initial = _values(bench, refits.points[0])
+    attached = tuple(bench.candidates[i] for i in included)
     numbers = {}
     for candidate in attached:
         for number in candidate.effect.parameters:
             name = candidate.parameter(number.name)
-            value = bench.value(selection.final.points[0], name)
+            value = bench.value(refits.points[0], name)
             scales = bench.scales[candidate.name]
             lower, upper = number.lower(scales), number.upper(scales)
             reach = 10.0 * abs(value) or bench.problem.coordinates.upper[bench.column[name]]
             lower = -reach if lower <= -UNLIMITED else min(lower, value)
             upper = reach if upper >= UNLIMITED else max(upper, value)
             parameters[name] = value
-            declared = bench.model.parameter(name)
-            numbers[name] = Parameter(name, name, declared.unit, value, lower, upper)
-    model = extended(bench.fit.model, attached, numbers, len(record) * record.sample_period)
-    order = {name: parameters[name] for name in model.free}
+            numbers[name] = Parameter(name, name, bench.model.parameter(name).unit, value, lower, upper)
+    model = bench.fit.model
+    if attached:
+        model = extended(model, attached, numbers, len(record) * record.sample_period)
+    parameters = {name: parameters[name] for name in model.free}
     return replace(
         bench.fit,
         model=model,
         records=(record,),
-        parameters=order,
+        parameters=parameters,
         initial=(initial,),
-        noise_variance=_variances(selection, selection.final.residual),
-        effort=bench.fit.effort._replace(refined=True, converged=bool(selection.final.converged[0])),
-        warnings=_at_bounds(model, order),
+        noise_variance=_variances(selection, refits),
+        effort=bench.fit.effort._replace(refined=True, converged=bool(refits.converged[0])),
+        warnings=_at_bounds(model, parameters),
     )
 
 
@@ -381,4 +386,3 @@ def _unseen(selection: Selection, causes: tuple[str, ...]) -> tuple[str, ...]:
     seen = {bench.candidates[s.candidate].name for s in selection.stages[-1].screening.ranked} & limits
     names = dict.fromkeys(c.name for c in bench.candidates)
     return tuple(name for name in names if name not in known | seen)
-

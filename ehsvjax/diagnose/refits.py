@@ -69,8 +69,8 @@ def refit(
 ) -> Refits:
     """Refit the chosen unknowns of every start.
 
-    Damping is relative to the diagonal and grows by 2, 4, 8, ... for steps in a row that did not lower the cost (Nielsen
-    1999); an unknown at a bound that the gradient pushes outwards is held there.
+    Damping is relative to the diagonal and grows by 2, 4, 8, ... for steps in a row that did not lower the cost
+    (Nielsen 1999); an unknown at a bound that the gradient pushes outwards is held there.
 
     Args:
         bench: the trials' workbench.
@@ -89,9 +89,9 @@ def refit(
     cost = np.full(count, np.inf)
     converged = np.zeros(count, bool)
     running = np.ones(count, bool)
-    for i in range(count):
-        own = chosen[i][chosen[i] >= 0]
-        points[i, own] = np.clip(points[i, own], lower[own], upper[own])
+    for k in range(count):
+        own = chosen[k][chosen[k] >= 0]
+        points[k, own] = np.clip(points[k, own], lower[own], upper[own])
     trial = points.copy()
     for iteration in range(iterations):
         at = np.flatnonzero(running)

@@ -1,5 +1,6 @@
 """The search for causes: add the one that explains most, refit, look again; then its rivals, swaps and deletions."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -9,9 +10,10 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.missing import curve_responses, quantities, strongest_dependence
 from ehsvjax.diagnose.noise import Whitening, noise_outside, whitening
-from ehsvjax.diagnose.refits import Refits, padded, refit
-from ehsvjax.diagnose.screening import Responses, Screened, Screening, responses_at, screen
+from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit
+from ehsvjax.diagnose.screening import Responses, Screened, Screening, complement, responses_at, screen
 from ehsvjax.diagnose.workbench import REFINED_ABREAST, Workbench
+from ehsvjax.effects.effect import Scales
 from ehsvjax.precision.residual_noise import ResidualNoise
 
 SIGNIFICANT = 0.002
@@ -21,11 +23,13 @@ INSEPARABLE = 3.5**2
 _MOST_EFFECTS = 3
 # A term of free form that explains so much more than the best candidate shows that the bank lacks something.
 _BANK_LACKS_IT = 3.0
+# Of what is left above the noise, what the next effect must take.
+_SHARE_OF_MISFIT = 0.15
 # Numbers of effects that can be refitted besides the model's unknowns; likelihood that each but the first must bring.
 _OWN_NUMBERS = 6
 _PER_NUMBER = 4.0
 # Shares of a linear estimate of an effect from which it is refitted too.
-_SHARES = (0.4, 0.1, 0.02)
+_SHARES = (2.0, 1.4, 0.7, 0.5, 0.35, 0.2, 0.1, 0.02)
 # Frequencies at which the residual is strongest that are tried, of itself and of its product with a motion.
 _PEAKS = 3
 
@@ -94,9 +98,9 @@ class _Search:
         return len(self.columns(included)) <= self.width
 
     def refits(self, starts: Sequence[np.ndarray], sets: Sequence[Sequence[int]], white: Whitening) -> Refits:
-        """Refit each start with its effects, or from where these effects have been refitted before if that is better."""
-        starts = self.best_of([[start, *self.known(s)] for start, s in zip(starts, sets, strict=True)], white)
-        found = refit(self.bench, starts, padded([self.columns(s) for s in sets], self.width), white)
+        """Refit each start with its effects, or from where these have been refitted before if that is better."""
+        best = self.best_of([[start, *self.known(s)] for start, s in zip(starts, sets, strict=True)], white)
+        found = refit(self.bench, best, padded([self.columns(s) for s in sets], self.width), white)
         for point, cost, included in zip(found.points, found.cost, sets, strict=True):
             if np.isfinite(cost):
                 self.reached[frozenset(included)] = point
@@ -106,34 +110,39 @@ class _Search:
         point = self.reached.get(frozenset(included))
         return [] if point is None else [point]
 
-    def best_of(self, choices: Sequence[Sequence[np.ndarray]], white: Whitening) -> np.ndarray:
-        """Return of each list of points the one that fits best."""
+    def best_of(
+        self, choices: Sequence[Sequence[np.ndarray]], white: Whitening, current: Refits | None = None
+    ) -> np.ndarray:
+        """Return of each list of points the one that fits best, or would after a linear refit of what `current` has."""
         if all(len(choice) == 1 for choice in choices):
             return np.stack([choice[0] for choice in choices])
         points = np.concatenate([np.stack(choice) for choice in choices])
-        cost = np.sum(white(self.bench.problem.samples.outputs - self.bench.simulated(points)) ** 2, axis=1)
+        r = white(self.bench.problem.samples.outputs - self.bench.simulated(points))
+        if current is not None:
+            known = complement(white(current.slopes[0]))
+            r = r - (r @ known) @ known.T
+        cost = np.sum(r**2, axis=1)
         cost = np.where(np.isfinite(cost), cost, np.inf)
         edges = np.cumsum([0, *(len(choice) for choice in choices)])
-        return np.stack(
-            [points[a + np.argmin(cost[a:b])] for a, b in zip(edges[:-1], edges[1:], strict=True)]
-        )  # fmt: skip
+        return np.stack([points[a + np.argmin(cost[a:b])] for a, b in itertools.pairwise(edges)])
 
-    def shortened(self, screened: Screened) -> list[np.ndarray]:
-        """Return the start of a candidate, and starts with less of the effect: a large one may be far from linear."""
+    def starts_of(self, screened: Screened) -> list[np.ndarray]:
+        """Return the start of a candidate, and starts with more or less of the effect, which may be far from linear."""
         candidate = self.bench.candidates[screened.candidate]
         amplitudes = [n for n in candidate.effect.parameters if n.absent is not None and abs(n.absent) < 1e29]
         columns = [self.bench.column[candidate.parameter(n.name)] for n in amplitudes]
         absent = np.array([n.absent for n in amplitudes]) / self.bench.problem.coordinates.upper[columns]
+        lower, upper = bounds_of(self.bench)
         starts = [screened.start]
         for share in _SHARES if columns else ():
             start = screened.start.copy()
-            start[columns] = absent + share * (start[columns] - absent)
+            start[columns] = np.clip(absent + share * (start[columns] - absent), lower[columns], upper[columns])
             starts.append(start)
         return starts
 
-    def refitted(self, some: Sequence[Screened], rest: Sequence[int], white: Whitening) -> Refits:
-        """Refit each screened candidate beside the effects that are there already."""
-        starts = self.best_of([self.shortened(s) for s in some], white)
+    def refitted(self, some: Sequence[Screened], rest: Sequence[int], white: Whitening, current: Refits) -> Refits:
+        """Refit each screened candidate beside the effects that are there already, from the refit without it."""
+        starts = self.best_of([self.starts_of(s) for s in some], white, current)
         return self.refits(list(starts), [(*rest, s.candidate) for s in some], white)
 
     def without(self, point: Float[np.ndarray, " parameter"], candidate: int) -> Float[np.ndarray, " parameter"]:
@@ -168,7 +177,7 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
     """Search for the causes of what a fit leaves of a record."""
     search = _Search(bench, progress)
     progress("refitting the model")
-    plain = _plain_noise(bench)
+    plain = plain_noise(bench, bench.problem.noise_variance)
     current = search.refits([bench.nominal], [()], plain)
     progress("simulating every candidate")
     stages = [search.stage((), current)]
@@ -211,11 +220,9 @@ def _gains(search: _Search, included, final: Refits, nominal: Refits, last: Stag
     return gains, needless
 
 
-def _plain_noise(bench: Workbench) -> Whitening:
-    """Return white noise of the fit's variances, with which the nominal model is refitted at first."""
-    noises = [
-        ResidualNoise(float("nan"), np.zeros(0), float(v), float(v)) for v in bench.problem.noise_variance
-    ]  # fmt: skip
+def plain_noise(bench: Workbench, variances: Float[np.ndarray, " signal"]) -> Whitening:
+    """Return white noise of these variances: least squares as `identify` does them."""
+    noises = [ResidualNoise(float("nan"), np.zeros(0), float(v), float(v)) for v in variances]
     return whitening(noises, bench.problem.samples.measured)
 
 
@@ -241,9 +248,7 @@ def _next_effect(search: _Search, stage: Stage) -> Stage | None:
     """Return the next look, with one effect more, or none if no effect is significant."""
     bench = search.bench
     hopeful = [
-        s
-        for s in stage.screening.ranked
-        if s.corrected < SIGNIFICANT and search.fits((*stage.included, s.candidate))
+        s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and search.fits((*stage.included, s.candidate))
     ]
     if not hopeful:
         return None
@@ -254,7 +259,7 @@ def _next_effect(search: _Search, stage: Stage) -> Stage | None:
         some = hopeful[first : first + REFINED_ABREAST]
         names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
         search.progress(f"refitting the model with {names}{', ...' if len(some) > 3 else ''}")
-        refitted = search.refitted(some, stage.included, stage.white)
+        refitted = search.refitted(some, stage.included, stage.white, stage.current)
         penalised = refitted.cost + [_PER_NUMBER * candidate_numbers(bench, s.candidate) for s in some]
         order = np.argsort(np.where(np.isnan(penalised), np.inf, penalised))
         chosen = int(order[0])
@@ -285,7 +290,9 @@ def _is_gain(search: _Search, stage: Stage, extended: Refits, candidate: int) ->
     whiter than it is.
     """
     required = required_gain(search.bench, stage.screening, candidate)
-    if not stage.current.cost[0] - extended.cost[0] > required:
+    removable = float(stage.current.cost[0]) - stage.white.used.sum()
+    # What takes only a little of a large misfit is not its cause.
+    if not stage.current.cost[0] - extended.cost[0] > max(required, _SHARE_OF_MISFIT * removable):
         return False
     measured = search.bench.problem.samples.measured
     own = noise_outside(extended.residual[0], measured, extended.slopes[0])
@@ -324,7 +331,7 @@ def _rivals_of(search: _Search, own: int, rest: tuple[int, ...], final: Refits, 
     screening = screen(bench, current, tried, white, 1)
     close = _close_rivals(screening.ranked, own)
     close = [s for s in close if search.fits((*rest, s.candidate))]
-    refitted = search.refitted(close, rest, white)
+    refitted = search.refitted(close, rest, white, current)
     rivals = [Rival(own, float(final.cost[0]) + _PER_NUMBER * candidate_numbers(bench, own), final)]
     for k, s in enumerate(close):
         cost = float(refitted.cost[k]) + _PER_NUMBER * candidate_numbers(bench, s.candidate)
@@ -368,7 +375,7 @@ def with_frequencies(bench: Workbench, current: Refits) -> Workbench:
     modulated = plain + _peaks(residual * motion, period, _PEAKS) + _peaks(
         residual * np.gradient(motion), period, _PEAKS
     )  # fmt: skip
-    scales = {
+    scales: dict[str, Scales] = {
         name: {**own, "frequencies": plain, "modulations": modulated} for name, own in bench.scales.items()
     }
     return replace(bench, scales=scales)

@@ -29,7 +29,6 @@ _ABREAST = 16
 REFINED_ABREAST = 8
 
 
-
 @dataclass(frozen=True, eq=False)
 class Workbench:
     """A fit and a record, ready for trials.

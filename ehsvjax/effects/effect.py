@@ -123,12 +123,22 @@ def constant(value: float) -> Callable[[Scales], float]:
     return lambda scales: value
 
 
+def _no_more(scales: Scales) -> float:
+    del scales
+    return UNLIMITED
+
+
+def _no_less(scales: Scales) -> float:
+    del scales
+    return -UNLIMITED
+
+
 def amplitude(
     name: str,
     unit: str,
     probe: Callable[[Scales], float],
-    lower: Callable[[Scales], float] = constant(-UNLIMITED),
-    upper: Callable[[Scales], float] = constant(UNLIMITED),
+    lower: Callable[[Scales], float] = _no_less,
+    upper: Callable[[Scales], float] = _no_more,
 ) -> EffectParameter:
     """Return a number to which the effect is proportional, at least while it is small."""
     return EffectParameter(name, unit, 0.0, lower, upper, lambda scales: (probe(scales),))
@@ -138,7 +148,7 @@ def size(
     name: str,
     unit: str,
     probe: Callable[[Scales], float],
-    upper: Callable[[Scales], float] = constant(UNLIMITED),
+    upper: Callable[[Scales], float] = _no_more,
 ) -> EffectParameter:
     """Return an amplitude that is never negative."""
     return amplitude(name, unit, probe, constant(0.0), upper)

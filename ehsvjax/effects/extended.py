@@ -166,12 +166,13 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             columns[c.signal] = c.effect.apply(own_of(c, parameters), columns[c.signal], context)
         return jnp.stack([columns[name] for name in names], axis=-1)
 
-    prepare = prepare if inputs else base.prepare
-    return base._replace(start=start, stepper=stepper, measure=measure, prepare=prepare, inputs=names)
+    return base._replace(
+        start=start, stepper=stepper, measure=measure, prepare=prepare if inputs else base.prepare, inputs=names
+    )
 
 
 class _Moment:
-    """The time and the memories at one moment, while a step is traced; the first call at a signal moves its memory on."""
+    """The time and the memories at one moment, while a step is traced; a signal's first call moves its memory on."""
 
     def __init__(self, time, step_size, memories, moving, added=None):
         self.time, self.step_size, self.memories, self._moving = time, step_size, dict(memories), set(moving)

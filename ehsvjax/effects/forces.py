@@ -1,4 +1,4 @@
-"""Effects on forces: friction, stiffness, constant and harmonic forces, in the signs of a driving force and of a load."""
+"""Effects on forces: friction, stiffness, constant and harmonic ones, in the signs of a driving force or a load."""
 
 import functools
 
@@ -61,7 +61,11 @@ def _harmonic(own, context):
 
 
 def _harmonic_parameters(unit):
-    return (amplitude("cosine", unit, constant(_PROBE)), amplitude("sine", unit, constant(_PROBE)), _frequency("frequencies"))
+    return (
+        amplitude("cosine", unit, constant(_PROBE)),
+        amplitude("sine", unit, constant(_PROBE)),
+        _frequency("frequencies"),
+    )
 
 
 def _stribeck_shape(scales: Scales):
@@ -81,7 +85,6 @@ def _stribeck(own, velocity):
 
 def _stop(side):
     """Return the force of a stop on one side, and its tries, shares of the largest position."""
-
     end = "positive_end" if side > 0 else "negative_end"
 
     def term(own, context):

@@ -83,7 +83,6 @@ def _sensor_play(own, value, context, memory):
     return level, (level,)
 
 
-
 INPUT = (
     Effect(
         "input_gain",

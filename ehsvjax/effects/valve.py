@@ -94,7 +94,11 @@ VALVE = (
         "opening",
         (
             EffectParameter(
-                "width", "{value}", 0.0, constant(0.0), lambda s: 0.3 * s["value"],
+                "width",
+                "{value}",
+                0.0,
+                constant(0.0),
+                lambda s: 0.3 * s["value"],
                 lambda s: [t * s["value"] for t in (0.003, 0.01, 0.03)],
             ),
         ),

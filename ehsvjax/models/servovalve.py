@@ -288,8 +288,8 @@ def _load_stage(parameters, h, signal):
     The load is linear, so that its flow is a straight line of the pressure, and what remains is a quadratic for the
     signed root r of the pressure drop. Its closed form never divides by xv: at xv = 0 (hydraulic lock) it gives Q = 0.
 
-    Dry friction R adds R*sgn(v1) to F. As v1 falls with F, the piston moves forward if it does so against F + R, backward
-    if it does so against F - R, and sticks otherwise: no chatter.
+    Dry friction R adds R*sgn(v1) to F. As v1 falls with F, the piston moves forward if it does so against F + R,
+    backward if it does so against F - R, and sticks otherwise: no chatter.
     """
     area = parameters["piston_area"]
     retraction_area = signal("retraction_area", area)
@@ -300,9 +300,7 @@ def _load_stage(parameters, h, signal):
         back = _load_equations(parameters, retraction_area, h, signal)
 
         def motion(position, velocity, pressure, opening, supply, force):
-            forward, backward = (
-                part(position, velocity, pressure, opening, supply, force) for part in (out, back)
-            )
+            forward, backward = (part(position, velocity, pressure, opening, supply, force) for part in (out, back))
             return tuple(jnp.where(opening < 0.0, b, f) for f, b in zip(forward, backward, strict=True))
 
     def stage(position, velocity, pressure, opening, supply, force, friction):

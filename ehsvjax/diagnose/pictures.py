@@ -1,0 +1,127 @@
+"""A diagnosis as pictures: what is wrong, where it comes from, what is left of it, and the form of a missing term."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ehsvjax.diagnose.diagnosis import Diagnosis
+from ehsvjax.plots import (
+    _AXIS,
+    _COMMAND,
+    _MEASURED,
+    _MODEL,
+    _PREFIXES,
+    _figure,
+    _legend,
+    _prefix,
+    _scaled,
+    _style,
+    _words,
+)
+
+if TYPE_CHECKING:
+    import matplotlib.figure
+
+_SUSPECTS = 14
+_PANELS = 3
+
+
+def plot_diagnosis(diagnosis: Diagnosis) -> "matplotlib.figure.Figure":
+    """Draw for each output the residual before and after, in time, in frequency and against quantities; the suspects.
+
+    Bands hold 95% of what noise alone would give.
+    """
+    names = list(diagnosis.misfit.outputs)
+    missing = diagnosis.missing is not None
+    with _style():
+        figure = _figure(width=10.0, height=4.6 * len(names) + 3.4)
+        parts = figure.subfigures(len(names) + 1, 1, height_ratios=[4.6] * len(names) + [3.4], squeeze=False)[:, 0]
+        for part, name in zip(parts, names, strict=False):
+            _draw_output(part, diagnosis, name)
+        widths = [1.3, 1.0] if missing else [1.0]
+        columns = parts[-1].subplots(1, len(widths), width_ratios=widths, squeeze=False)
+        _draw_suspects(columns[0, 0], diagnosis)
+        if missing:
+            _draw_missing(columns[0, 1], diagnosis)
+    return figure
+
+
+def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
+    found = diagnosis.misfit.outputs[name]
+    unit = diagnosis.fit.model.unit(name)
+    grid = part.add_gridspec(2, _PANELS, height_ratios=[1.0, 1.1])
+    series = part.add_subplot(grid[0, :2])
+    spectrum = part.add_subplot(grid[0, 2])
+    time = diagnosis.record.time
+    factor, label = _scaled(found.residual, unit)
+    before = {"color": _MEASURED, "ls": "none", "marker": ".", "ms": 2.0, "rasterized": True}
+    series.plot(time, found.residual / factor, label="the model", **before)
+    after = np.where(np.isnan(found.residual), np.nan, diagnosis.extended.residuals(diagnosis.record)[name])
+    if diagnosis.extended.model is not diagnosis.fit.model:
+        series.plot(time, after / factor, label="extended", **{**before, "color": _MODEL})
+    reach = 1.96 * found.noise_floor / factor
+    series.axhspan(-reach, reach, color=_COMMAND, alpha=0.12, lw=0, label="95% of the noise")
+    series.set(xlabel="time (s)", ylabel=f"residual of\n{_words(name)} {label}")
+    _legend(series)
+    shown = found.in_frequency
+    spectrum.loglog(shown.frequency, shown.residual, color=_MEASURED, label="residual")
+    spectrum.loglog(shown.frequency, shown.noise, color=_COMMAND, label="noise")
+    spectrum.set(xlabel="frequency (Hz)", ylabel=f"power ({unit}²/Hz)" if unit else "power (1/Hz)")
+    _legend(spectrum)
+    for k, quantity in enumerate(_most_telling(found.against)):
+        axes = part.add_subplot(grid[1, k])
+        profile = found.against[quantity]
+        across, across_label = _scaled(profile.middle, _unit(diagnosis, quantity))
+        mean, mean_label = _scaled(profile.mean, unit)
+        axes.fill_between(
+            profile.middle / across, -1.96 * profile.deviation / mean, 1.96 * profile.deviation / mean,
+            color=_COMMAND, alpha=0.15, lw=0,
+        )  # fmt: skip
+        axes.plot(profile.middle / across, profile.mean / mean, color=_MEASURED, marker="o", ms=4)
+        axes.axhline(0.0, color=_AXIS, lw=0.8)
+        axes.set(xlabel=f"{_words(quantity)} {across_label}", ylabel=f"mean residual {mean_label}" if k == 0 else "")
+
+
+def _most_telling(against) -> list[str]:
+    """Return the quantities against which the mean residual differs most from nothing."""
+
+    def excess(profile):
+        return float(np.mean((profile.mean / profile.deviation) ** 2))
+
+    return sorted(against, key=lambda quantity: -excess(against[quantity]))[:_PANELS]
+
+
+def _unit(diagnosis: Diagnosis, quantity: str) -> str:
+    units = {"time": "s", "velocity": "m/s", "flow": "m^3/s", "load_force": "N"}
+    units |= {s.name: s.unit for s in diagnosis.fit.model.signals}
+    return units.get(quantity, "")
+
+
+def _draw_suspects(axes, diagnosis: Diagnosis) -> None:
+    table = diagnosis.table
+    table = table[np.isfinite(table["score"].astype(float))].drop_duplicates("cause").head(_SUSPECTS)[::-1]
+    within = {name for a in diagnosis.alternatives for name in a.causes} | set(diagnosis.causes)
+    colours = [_MODEL if cause in within else _MEASURED for cause in table["cause"]]
+    axes.barh(range(len(table)), np.abs(table["score"].astype(float)), color=colours)
+    axes.set_yticks(range(len(table)), [_words(cause) for cause in table["cause"]], fontsize=8)
+    axes.set_xscale("symlog", linthresh=5.0)
+    axes.set(xlabel="score on the nominal model (standard deviations)", title="suspects")
+    axes.grid(axis="y", visible=False)
+
+
+def _draw_missing(axes, diagnosis: Diagnosis) -> None:
+    m = diagnosis.missing
+    assert m is not None
+    factor, label = _scaled(m.at, m.quantity_unit)
+    prefix = "" if m.relative else _prefix(float(np.max(np.abs(m.estimate))), m.unit)
+    size = 0.01 if m.relative else _PREFIXES[prefix]
+    unit = "%" if m.relative else f"{prefix}{m.unit}" or "–"
+    low, high = (m.estimate + side * 1.96 * m.deviation for side in (-1.0, 1.0))
+    axes.fill_between(m.at / factor, low / size, high / size, color=_MODEL, alpha=0.2, lw=0)
+    axes.plot(m.at / factor, m.estimate / size, color=_MODEL, marker="o", ms=3)
+    axes.axhline(0.0, color=_AXIS, lw=0.8)
+    # Where hardly anything was seen, the band would hide the rest.
+    reach = 2.0 * float(np.max(np.abs(m.estimate))) / size
+    axes.set_ylim(max(-reach, axes.get_ylim()[0]), min(reach, axes.get_ylim()[1]))
+    axes.set(xlabel=f"{_words(m.quantity)} {label}", ylabel=f"missing at {_words(m.place)} ({unit})",
+             title="the missing term, no form assumed")  # fmt: skip
