@@ -317,7 +317,7 @@ def _unexplained(final: Refits, white: Whitening):
     return known, r - known @ (known.T @ r)
 
 
-def _outside(known, responses) -> Float[np.ndarray, "sample direction"]:
+def _outside(known, responses) -> Float[np.ndarray, "sample independent"]:
     """Return an orthonormal basis of the responses outside what the unknowns can do."""
     norms = np.linalg.norm(responses, axis=1)
     rows = responses[norms > 0] / norms[norms > 0, None]

@@ -141,7 +141,7 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
     return found
 
 
-def complement(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample direction"]:
+def complement(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
     """Return an orthonormal basis of what the unknowns can do."""
     norms = np.linalg.norm(slopes, axis=1)
     kept = slopes[norms > 0] / norms[norms > 0, None]

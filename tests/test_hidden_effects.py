@@ -1,0 +1,116 @@
+"""An independent plant hides an effect in a record; the package gets the record alone and must find it."""
+
+import os
+import secrets
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnose import Diagnosis, diagnose
+from tests.hidden_plants import effect_sizes
+from tests.hidden_records import Hidden, expected, records
+
+# A fresh seed each time; set the variable to repeat a run.
+FRESH = int(os.environ.get("EHSVJAX_SEED", secrets.randbelow(2**31)))
+# Low noise, so that nearly every plausible size shows in a short record.
+VARIANCE = {"servovalve": 1e-10, "van_der_pol": 1e-4}
+SAMPLES = {"servovalve": 2000, "van_der_pol": 1500}
+MODELS = {"servovalve": ehsvjax.servovalve, "van_der_pol": ehsvjax.van_der_pol}
+# Noise variances that an effect must be worth, to first order, for a test to demand that it is seen.
+PLAIN = 100.0
+
+
+def known(model: str) -> list[str]:
+    # Quantisation is noise until it is coarser than the noise; it has a test of its own.
+    return [n for n in effect_sizes(model) if not n.startswith("unknown") and n != "sensor_quantisation"]
+
+
+def diagnosed(hidden: Hidden) -> tuple[Diagnosis, float, str]:
+    """Return the diagnosis of a record, what the plant says that its effects are worth, and how to repeat it."""
+    (made,) = records([hidden], SAMPLES[hidden.model])
+    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
+    key = jax.random.key(hidden.seed)
+    fit = ehsvjax.identify(MODELS[hidden.model](), record, key=key, population=50, generations=20)
+    found = diagnose(fit, record, key=key)
+    worth = 0.0 if not hidden.names or hidden.names == ("process_noise",) else expected(hidden, made)[0]
+    return found, worth, f"{hidden}, sizes {made.sizes}, worth {worth:.0f}\n{found}"
+
+
+def base(cause: str) -> str:
+    return cause.partition("@")[0]
+
+
+def held(found: Diagnosis) -> set[str]:
+    return {base(c) for c in found.causes} | {base(c) for a in found.alternatives for c in a.causes}
+
+
+def check_found(hidden: Hidden) -> None:
+    found, worth, said = diagnosed(hidden)
+    if found.verdict == "adequate":
+        assert worth < PLAIN, said
+    else:
+        assert found.verdict in ("named", "ambiguous"), said
+        assert hidden.names[0] in held(found), said
+        assert len(found.causes) == 1, said
+
+
+@pytest.mark.parametrize("name", known("van_der_pol"))
+def test_an_effect_of_the_oscillator_is_found(name):
+    check_found(Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], (name,), 1))
+
+
+@pytest.mark.parametrize("name", known("servovalve"))
+def test_an_effect_of_the_servovalve_is_found(name):
+    check_found(Hidden("servovalve", "white", VARIANCE["servovalve"], (name,), 1))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_an_effect_drawn_afresh_is_found(model):
+    name = known(model)[FRESH % len(known(model))]
+    check_found(Hidden(model, "white", VARIANCE[model], (name,), FRESH))
+
+
+@pytest.mark.parametrize("kind", ["white", "AR", "quantised", "outliers"])
+@pytest.mark.parametrize("model", MODELS)
+def test_nothing_hidden_is_adequate(model, kind):
+    found, _, said = diagnosed(Hidden(model, kind, 100 * VARIANCE[model], (), 2))
+    assert found.verdict == "adequate", said
+    assert found.causes == () and found.alternatives == ()
+    assert found.excluded, "an adequate model excludes something"
+    if kind == "outliers":
+        assert found.misfit.outputs["position"].outliers.any(), said
+    if kind == "AR":
+        assert found.misfit.outputs["position"].coloured, said
+
+
+def test_two_effects_together_are_both_found():
+    for model, pair in (
+        ("servovalve", ("transport_delay", "area_asymmetry")),
+        ("van_der_pol", ("sensor_bias", "cubic_stiffness")),
+    ):
+        found, _, said = diagnosed(Hidden(model, "white", VARIANCE[model], pair, 5))
+        assert set(pair) <= held(found), said
+
+
+@pytest.mark.parametrize(
+    ("model", "name", "quantity"),
+    [("servovalve", "unknown_cogging", "position"), ("servovalve", "unknown_spool_notch", "opening")],
+)
+def test_an_effect_that_the_bank_lacks_is_unexplained(model, name, quantity):
+    found, _, said = diagnosed(Hidden(model, "white", VARIANCE[model], (name,), 3))
+    assert found.verdict == "unexplained" or not found.innocent, said
+    assert found.missing is not None, said
+    del quantity
+
+
+def test_readings_coarser_than_the_noise_are_quantised():
+    hidden = Hidden("servovalve", "white", 1e-9, (), 4)
+    (made,) = records([hidden], SAMPLES["servovalve"])
+    step = 2e-4
+    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": step * np.round(made.position / step)})
+    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=jax.random.key(0), population=50, generations=20)
+    found = diagnose(fit, record, key=jax.random.key(0))
+    assert found.causes == ("sensor_quantisation",), str(found)
+    assert found.misfit.outputs["position"].lattice == pytest.approx(step, rel=1e-6)
