@@ -21,7 +21,7 @@ from ehsvjax.precision.residual_noise import (
 
 # Directions of the candidates' responses below this share of the largest are counted as noise.
 _NEGLIGIBLE = 1e-3
-# A sample stands alone if it differs from both its neighbours by this many deviations of a difference.
+# A sample stands alone if it differs from its neighbours by this many deviations of a difference.
 _SPIKE = 4.0
 
 
@@ -154,27 +154,29 @@ def spikes(
     measured: Bool[np.ndarray, "record time signal"],
     outputs: Float[np.ndarray, "record time signal"],
 ) -> Bool[np.ndarray, "record time signal"]:
-    """Return samples that stand alone, far from both neighbours and on one side of them, residual and reading alike.
+    """Return samples that stand alone, on one side of nearly all their neighbours, residual and reading alike.
 
-    A misfit of a jump stands alone in the residual, but not in the reading: it is no spike.
+    A misfit of a jump stands alone in the residual, but not in the reading: it is no spike. One neighbour may be a spike
+    itself.
     """
     found = np.zeros_like(measured)
     for i in range(residual.shape[-1]):
-        both = np.ones(measured.shape[:2], bool)
         differences = np.diff(residual[..., i], axis=1)[measured[:, 1:, i] & measured[:, :-1, i]]
         spread = 1.4826 * np.median(np.abs(differences - np.median(differences))) if len(differences) else 0.0
         if spread == 0.0:
             continue
-        for series in (residual[..., i], outputs[..., i]):
-            for reach in (1, 2):
-                before, after = np.full(series.shape, np.nan), np.full(series.shape, np.nan)
-                before[:, reach:] = series[:, reach:] - series[:, :-reach]
-                after[:, :-reach] = series[:, :-reach] - series[:, reach:]
-                alone = (before * after > 0) & (np.fmin(np.abs(before), np.abs(after)) > _SPIKE * spread)
-                both &= alone | (np.isnan(before) | np.isnan(after))
-        found[..., i] = both & measured[..., i]
-        found[:, :1, i] = found[:, -1:, i] = False
+        alone = [_alone(series[..., i], _SPIKE * spread) for series in (residual, outputs)]
+        found[..., i] = alone[0] & alone[1] & measured[..., i]
     return found
+
+
+def _alone(series: Float[np.ndarray, "record time"], apart: float) -> Bool[np.ndarray, "record time"]:
+    """Return samples that lie further than this on one side of all but one of the three before and the three after."""
+    reach = 3
+    filled = np.pad(series, ((0, 0), (reach, reach)), constant_values=np.nan)
+    length = series.shape[1]
+    neighbours = np.stack([filled[:, k : k + length] for k in range(2 * reach + 1) if k != reach])
+    return np.maximum(*(np.sum(side * (series - neighbours) > apart, axis=0) for side in (1, -1))) >= 2 * reach - 1
 
 
 def lattice(values: Float[np.ndarray, " time"]) -> float | None:
