@@ -32,7 +32,7 @@ from tqdm import tqdm
 import ehsvjax
 from ehsvjax.diagnose import diagnose
 from tests.hidden_plants import effect_sizes
-from tests.hidden_records import Hidden, expected, records
+from tests.hidden_records import Hidden, expected, records, worth_each
 
 matplotlib.use("Agg")
 
@@ -85,6 +85,8 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"kind": trial.kind, **hidden._asdict(), "sizes": one.sizes}
         if trial.kind == "one" and hidden.names != ("process_noise",):
             row["worth"], row["rival_deficit"], row["rival"] = expected(hidden, one)
+        if trial.kind == "two":
+            row["worth_each"] = worth_each(hidden, one)
         key = jax.random.key(hidden.seed)
         began = time.perf_counter()
         try:
@@ -150,6 +152,9 @@ def summary(table: pd.DataFrame) -> list[str]:
         some = table[table["kind"] == kind]
         if len(some):
             lines.append(f"{kind}: {counts(some)}")
+            if kind == "two":
+                seen = some[[worths is not None and min(worths) > SEPARABLE for worths in some["worth_each"]]]
+                lines.append(f"    both worth more than {SEPARABLE:g} beside the other: {counts(seen)}")
             for noise in some["noise"].unique() if kind == "none" else ():
                 lines.append(f"    {noise}: {counts(some[some['noise'] == noise])}")
     right = table[table["outcome"].isin(["named", "ambiguous, truth within"])]

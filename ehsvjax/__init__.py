@@ -7,13 +7,17 @@ The pipeline, each step usable by itself:
     fit = identify(model, record, key=...)           genetic search and gradient refinement (`identify`)
     print(fit); fit.plot(); fit.score(other_record)  the result (`fit`)
     fit.precision(); fit.profile_likelihood()        how sure it is (`precision`); before any data: `design`
+    diagnosis = diagnose(fit, record, key=...)       what it gets wrong and why (`diagnose`), of all known `effects`
+    print(diagnosis); diagnosis.extended             the cause, and the fit of the model that has it
 
 Axes, wherever a shape is given: record, individual (a candidate of the population), parameter (an unknown, initial
 conditions included), generation, time (a sample), signal (an output). SI units throughout.
 """
 
-from ehsvjax import excitation, hydraulics, operators
+from ehsvjax import effects, excitation, hydraulics, operators
 from ehsvjax.columns import Column
+from ehsvjax.diagnose import diagnose
+from ehsvjax.effects import Effect
 from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators
 from ehsvjax.identify import identify
@@ -25,6 +29,7 @@ from ehsvjax.simulate import simulate
 
 __all__ = [
     "Column",
+    "Effect",
     "Fit",
     "Model",
     "Operators",
@@ -33,6 +38,8 @@ __all__ = [
     "Signal",
     "cramer_rao_bound",
     "design",
+    "diagnose",
+    "effects",
     "excitation",
     "hydraulics",
     "identify",

@@ -155,3 +155,24 @@ def expected(hidden: Hidden, made: Made) -> tuple[float, float, str]:
     alike = {name: float((unit @ d) ** 2) for name, d in directions.items() if name not in hidden.names}
     rival = max(alike, key=lambda name: alike[name])
     return worth, worth * (1.0 - alike[rival]), rival
+
+
+def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
+    """Return the noise variances that each of several effects is worth beside the others; None with random ones."""
+    if "process_noise" in hidden.names:
+        return None
+    nominal, basis, _ = library(hidden.model, made.excitation, len(made.time))
+    alone = plant(
+        hidden.model,
+        [{name: made.sizes[name]} for name in hidden.names],
+        np.tile(made.command, (len(hidden.names), 1)),
+        excitation(hidden.model, 0)[1],
+    )
+    changes = alone - nominal
+    worths = []
+    for i in range(len(changes)):
+        others = np.concatenate([basis, np.delete(changes, i, axis=0).T], axis=1)
+        q = np.linalg.qr(others)[0]
+        left = changes[i] - q @ (q.T @ changes[i])
+        worths.append(float(left @ left) / hidden.variance)
+    return tuple(worths)

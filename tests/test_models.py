@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
+from ehsvjax import effects
 from ehsvjax.integrators import runge_kutta_4
 from ehsvjax.models import Model, Parameter, Signal, identity, servovalve, van_der_pol
 from ehsvjax.record import Record
@@ -70,7 +71,7 @@ every_model = pytest.mark.parametrize("name", MAKERS)
 
 # A command that moves each model, its sample period, and a start off the equilibrium.
 RUNS = {"Van der Pol": (1.5, 0.02, {"initial_position": 0.5}), "user's own": (10.0, 0.01, {"x0": 0.2})}
-SIZES = {"m": 2e-4, "Pa": 1e5, "N": 500.0, "": 0.1}
+SIZES = {"m": 2e-4, "Pa": 1e5, "N": 500.0, "": 0.1, "m/s": 0.05, "m^2": 1e-4, "m^3/(s Pa)": 1e-12, "m^3/Pa": 1e-12}
 
 
 def record_for(name):
@@ -121,7 +122,8 @@ def test_names_are_declared_once_and_in_one_place(name):
     assert len({s.name for s in model.signals}) == len(model.signals)
     assert set(model.free) <= set(model.nominal) == {p.name for p in model.parameters}
     assert model.outputs
-    assert {s.kind for s in model.signals} <= {"input", "displacement", "pressure", "flow", "force", "sensor"}
+    # Every line is one that some effect can disturb.
+    assert {s.kind for s in model.signals} <= {effect.kind for effect in effects.BANK}
     assert {p.output for p in model.initial} <= {None, *model.outputs}
     assert all(isinstance(p.symbol, str) and isinstance(p.unit, str) for p in model.parameters)
 

@@ -2,15 +2,16 @@
 
 import os
 from dataclasses import dataclass
-from typing import NamedTuple
-
-import pandas as pd
+from typing import TYPE_CHECKING, NamedTuple
 
 from ehsvjax.diagnose.gain import Gain
 from ehsvjax.diagnose.misfit import Misfit
 from ehsvjax.diagnose.missing import MissingTerm
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
+
+if TYPE_CHECKING:
+    import pandas
 
 
 class Alternative(NamedTuple):
@@ -53,7 +54,7 @@ class Diagnosis:
     verdict: str
     causes: tuple[str, ...]
     alternatives: tuple[Alternative, ...]
-    table: pd.DataFrame
+    table: "pandas.DataFrame"
     extended: Fit
     gain: Gain
     misfit: Misfit

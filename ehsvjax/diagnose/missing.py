@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of
@@ -133,6 +132,8 @@ def dependences(
         seen: the quantities.
 
     """
+    from scipy.special import chdtrc
+
     curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
     known, r = _unexplained(final, white)
     changes = white(_responses(bench, final.points[0], curves))
@@ -145,8 +146,8 @@ def dependences(
     for q, statistic in zip(bases, statistics, strict=True):
         part = drawn[:, column : column + q.shape[1]]
         column += q.shape[1]
-        p_values.append(float(stats.chi2.sf(statistic, q.shape[1])))
-        null = np.minimum(null, stats.chi2.sf(np.sum(part**2, axis=1), q.shape[1]))
+        p_values.append(float(chdtrc(q.shape[1], statistic)))
+        null = np.minimum(null, chdtrc(q.shape[1], np.sum(part**2, axis=1)))
     null.sort()
     found = []
     for curve, q, statistic, p in zip(curves, bases, statistics, p_values, strict=True):

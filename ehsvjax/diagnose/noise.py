@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import toeplitz
 
 from ehsvjax.precision.residual_noise import (
     ResidualNoise,
@@ -60,7 +59,8 @@ def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample
     """Return what makes the first samples of an autoregression, which none come before, white like the others."""
     order = len(noise.coefficients)
     covariance = np.real(np.fft.ifft(noise.spectrum(8192)))[:order]
-    root = np.linalg.cholesky(toeplitz(covariance) + 1e-12 * covariance[0] * np.eye(order))
+    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(order), np.arange(order)))]
+    root = np.linalg.cholesky(toeplitz + 1e-12 * covariance[0] * np.eye(order))
     return np.sqrt(noise.innovation_variance) * np.linalg.inv(root)
 
 
@@ -156,8 +156,8 @@ def spikes(
 ) -> Bool[np.ndarray, "record time signal"]:
     """Return samples that stand alone, on one side of nearly all their neighbours, residual and reading alike.
 
-    A misfit of a jump stands alone in the residual, but not in the reading: it is no spike. One neighbour may be a spike
-    itself.
+    A misfit of a jump stands alone in the residual, but not in the reading: it is no spike. One neighbour may be a
+    spike itself.
     """
     found = np.zeros_like(measured)
     for i in range(residual.shape[-1]):

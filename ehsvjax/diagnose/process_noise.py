@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.screening import complement
@@ -71,6 +70,8 @@ def _responses(bench: Workbench, point, place) -> tuple[Float[np.ndarray, "part 
 
 def _likelihood_of_force(h, r) -> tuple[float, float]:
     """Return the variance of the force of a part, and the log-likelihood, at their best."""
+    from scipy.optimize import minimize_scalar
+
     vectors, values, _ = np.linalg.svd(h.T, full_matrices=False)
     z2 = (vectors.T @ r) ** 2
     rest = max(float(r @ r - z2.sum()), 1e-300)

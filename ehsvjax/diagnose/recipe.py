@@ -7,7 +7,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 from jaxtyping import Array, Key
 
 from ehsvjax.diagnose.diagnosis import Alternative, Diagnosis, Excluded
@@ -309,8 +308,10 @@ class _Row(NamedTuple):
     included: bool
 
 
-def _table(selection: Selection) -> pd.DataFrame:
+def _table(selection: Selection):
     """Return all candidates on the nominal model, those that were included first."""
+    import pandas as pd
+
     bench = selection.bench
     screening = selection.stages[0].screening
     responses = np.array([s.response for s in screening.ranked])

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of
@@ -162,6 +161,8 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
         harmonics: how many frequencies were searched for the few that were tried.
 
     """
+    from scipy.special import ndtri
+
     r = white(current.residual[0])
     known = complement(white(current.slopes[0]))
     g = white(tried.changes)
@@ -233,16 +234,18 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
             best[trial.candidate] = found
     ranked = tuple(sorted(best.values(), key=lambda s: (s.p_value, -abs(s.score))))
     unseen = tuple(sorted({t.candidate for t in tried.trials} - set(best)))
-    threshold = float(stats.norm.isf(0.5 * max(null[int(1e-3 * _DRAWS)], 1e-12)))
+    threshold = float(-ndtri(0.5 * max(null[int(1e-3 * _DRAWS)], 1e-12)))
     return Screening(ranked, unseen, tried.changes, threshold)
 
 
 def _p_value(u: Float[np.ndarray, "draw step"], trial: Trial) -> Float[np.ndarray, " draw"]:
+    from scipy.special import chdtrc, ndtr
+
     if u.shape[1] > 1:
-        return stats.chi2.sf(np.sum(u**2, axis=1), u.shape[1])
+        return chdtrc(u.shape[1], np.sum(u**2, axis=1))
     if trial.one_sided:
-        return stats.norm.sf(u[:, 0])
-    return 2.0 * stats.norm.sf(np.abs(u[:, 0]))
+        return ndtr(-u[:, 0])
+    return 2.0 * ndtr(-np.abs(u[:, 0]))
 
 
 def _start(bench: Workbench, trial: Trial, g, r, left):

@@ -2,8 +2,11 @@
 
 import functools
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -26,8 +29,6 @@ def internal_signals(
     grid = grid_of(model, record)
     watched = _watched(model.equations, record.sample_period / grid.substeps)
     names = _names_of(model, watched)
-    from dataclasses import replace
-
     seen = simulate(
         replace(
             model,
@@ -61,7 +62,6 @@ def _parts(name: str) -> tuple[str, str]:
 
 def _names_of(model: Model, watched: Equations) -> list[str]:
     """Return the names under which the watched equations report, by tracing them once."""
-    import jax
 
     def outputs():
         values = {p.name: 1.0 for p in model.parameters}
@@ -88,12 +88,6 @@ def _watched(base: Equations, step_size: float) -> Equations:
 
         base.stepper(parameters, step_size, watching)(state, lambda fraction: inputs)
         outputs = base.measure(parameters, state, inputs, watching)
-        return outputs | {name: 1.0 * _array(value) for name, value in seen.items()}
+        return outputs | {name: jnp.asarray(value, float) for name, value in seen.items()}
 
     return base._replace(measure=measure)
-
-
-def _array(value):
-    import jax.numpy as jnp
-
-    return jnp.asarray(value)
