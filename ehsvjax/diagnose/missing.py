@@ -58,6 +58,7 @@ class MissingTerm(NamedTuple):
         series: `[time]` the term along the record.
         relative: whether the estimate is a share of the value at the place.
         explained: share of the residual's sum of squares above the noise that it takes.
+        likelihood: twice its logarithm with this term, less Bayes' price for its pieces; for one output.
 
     """
 
@@ -71,6 +72,7 @@ class MissingTerm(NamedTuple):
     series: Float[np.ndarray, " time"]
     relative: bool
     explained: float
+    likelihood: float
 
 
 class _Curve(NamedTuple):
@@ -200,7 +202,13 @@ def missing_term(
         series=estimate @ curve.pieces,
         relative=curve.relative,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
+        likelihood=likelihood(best.left, len(r), white) - len(estimate) * float(np.log(len(r))),
     )
+
+
+def likelihood(left: float, count: int, white: Whitening) -> float:
+    """Return twice the logarithm of the likelihood of whitened residuals with this sum of squares, at its best."""
+    return -count * float(np.log(white.noises[0].innovation_variance * left / count)) - count
 
 
 class _Attempt(NamedTuple):

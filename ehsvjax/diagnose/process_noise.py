@@ -39,7 +39,7 @@ def process_noise(bench: Workbench, final: Refits) -> ProcessNoise | None:
     """Compare a random force with noise of the sensor; None for several outputs, or a model without a force."""
     samples = bench.problem.samples
     kinds = {s.name: s.kind for s in bench.fit.model.signals}
-    places = [p for p in bench.places if kinds[p] in ("force", "load")]
+    places = [p for p in bench.places if kinds[p] == "force"]
     if not places or len(bench.problem.observed) > 1:
         return None
     measured = samples.measured[..., 0]

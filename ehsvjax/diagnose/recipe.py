@@ -12,7 +12,7 @@ from jaxtyping import Array, Key
 from ehsvjax.diagnose.diagnosis import Alternative, Diagnosis, Excluded
 from ehsvjax.diagnose.gain import gain_of
 from ehsvjax.diagnose.misfit import Misfit, misfit_of
-from ehsvjax.diagnose.missing import Dependence, dependences, missing_term
+from ehsvjax.diagnose.missing import Dependence, MissingTerm, dependences, likelihood, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside, spikes
 from ehsvjax.diagnose.process_noise import CONVINCING, process_noise
 from ehsvjax.diagnose.refits import Refits, padded, refit
@@ -78,10 +78,11 @@ def diagnose(
     if innocent:
         selection = replace(selection, white=_own_noise(selection))
     misfit = misfit_of(selection, outliers, after)
-    verdict, causes, alternatives = _verdict(selection, misfit, innocent, shaken)
+    without_form = len(selection.included) > 1 and _better_without_form(selection)
+    verdict, causes, alternatives = _verdict(selection, misfit, innocent, shaken, without_form)
     missing = None
-    if not innocent and verdict != "named":
-        missing = missing_term(selection.bench, selection.final, selection.white, selection.seen, after[:_SUSPECTS])
+    if verdict == "unexplained" or not innocent:
+        missing = _missing(selection, after, without_form)
     say("measuring the gain")
     nominal, wider = (
         _as_fit(selection, _ordinary(selection, refits, included), included, record)
@@ -174,15 +175,22 @@ def _random_force(selection: Selection, innocent: bool) -> tuple[Selection, bool
 
     Then it is without the causes: what they seemed to explain was the motion that the force had left behind.
     """
-    nominal = process_noise(selection.bench, selection.nominal)
+    bench = selection.bench
+    nominal = process_noise(bench, selection.nominal)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
         return selection, False
+    if not innocent:
+        # A term that depends on what runs along the model is a better reason than chance.
+        seen, white = selection.seen, selection.white
+        suspects = dependences(bench, selection.nominal, white, seen)[:_SUSPECTS]
+        if missing_term(bench, selection.nominal, white, seen, suspects).likelihood > nominal.likelihood:
+            return selection, False
     if not selection.included:
         return selection, True
-    final = process_noise(selection.bench, selection.final)
+    final = process_noise(bench, selection.final)
     assert final is not None
-    numbers = sum(candidate_numbers(selection.bench, i) for i in selection.included) - 1
-    count = selection.bench.problem.samples.measured.sum()
+    numbers = sum(candidate_numbers(bench, i) for i in selection.included) - 1
+    count = bench.problem.samples.measured.sum()
     # Causes that leave nothing unexplained have the first word.
     margin = CONVINCING if innocent else 0.0
     if nominal.likelihood - final.of_sensor + numbers * np.log(count) > margin:
@@ -191,7 +199,26 @@ def _random_force(selection: Selection, innocent: bool) -> tuple[Selection, bool
     return selection, False
 
 
-def _verdict(selection: Selection, misfit: Misfit, innocent: bool, shaken: bool):
+def _missing(selection: Selection, after: tuple[Dependence, ...], without_form: bool) -> MissingTerm:
+    """Return what is missing beside the causes that were found, or in the place of them all."""
+    bench, white, seen = selection.bench, selection.white, selection.seen
+    if without_form:
+        suspects = dependences(bench, selection.nominal, white, seen)
+        return missing_term(bench, selection.nominal, white, seen, suspects[:_SUSPECTS])
+    return missing_term(bench, selection.final, white, seen, after[:_SUSPECTS])
+
+
+def _better_without_form(selection: Selection) -> bool:
+    """Whether one term of free form explains the record better than several causes together: the bank lacks it."""
+    bench, white = selection.bench, selection.white
+    suspects = dependences(bench, selection.nominal, white, selection.seen)[:_SUSPECTS]
+    term = missing_term(bench, selection.nominal, white, selection.seen, suspects)
+    r = white(selection.final.residual[0])
+    numbers = sum(candidate_numbers(bench, i) for i in selection.included)
+    return term.likelihood > likelihood(float(r @ r), len(r), white) - numbers * np.log(len(r))
+
+
+def _verdict(selection: Selection, misfit: Misfit, innocent: bool, shaken: bool, without_form: bool):
     """Return the verdict, the causes and the alternatives."""
     bench = selection.bench
     order = np.argsort([-gain for gain in selection.gains])
@@ -206,7 +233,7 @@ def _verdict(selection: Selection, misfit: Misfit, innocent: bool, shaken: bool)
     removed = float(selection.nominal.cost[0] - selection.final.cost[0])
     left = max(misfit.tests_after[0].explained, 0.0)
     explained = removed / max(removed + left, 1e-300)
-    if not innocent and (not groups or explained < _EXPLAINED):
+    if without_form or (not innocent and (not groups or explained < _EXPLAINED)):
         return "unexplained", (), ()
     causes = tuple(group[0] for group in groups) + quantised + ((PROCESS_NOISE,) if shaken else ())
     if not causes:
@@ -377,7 +404,7 @@ def _excluded(selection: Selection, causes: tuple[str, ...]) -> tuple[Excluded, 
         unit = bench.model.parameter(candidate.parameter(number.name)).unit
         if candidate.name not in least or above < least[candidate.name].above:
             least[candidate.name] = Excluded(candidate.name, float(above), unit)
-    return tuple(least.values())
+    return tuple(sorted(least.values(), key=lambda e: [c.name for c in bench.candidates].index(e.cause)))
 
 
 def _unseen(selection: Selection, causes: tuple[str, ...]) -> tuple[str, ...]:

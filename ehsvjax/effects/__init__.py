@@ -1,5 +1,6 @@
 """Effects that a model may lack: the bank of candidate causes, and models extended by them."""
 
+from ehsvjax.effects.attach import attach
 from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, amplitude, candidates, limit, shape, size, width
 from ehsvjax.effects.extended import effects_of, extended
 from ehsvjax.effects.forces import FORCE, FRICTION, LOAD
@@ -15,6 +16,7 @@ __all__ = [
     "Effect",
     "EffectParameter",
     "amplitude",
+    "attach",
     "candidates",
     "effects_of",
     "extended",
