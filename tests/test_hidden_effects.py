@@ -1,4 +1,8 @@
-"""An independent plant hides an effect in a record; the package gets the record alone and must find it."""
+"""An independent plant hides an effect in a record; the package gets the record alone and must find it.
+
+By default some of the effects of each model are hidden in turn, and one that is drawn afresh; all of them with
+EHSVJAX_SWEEP=1 (some ten minutes), as benchmarks/diagnosis.py does at three noise levels.
+"""
 
 import os
 import secrets
@@ -14,6 +18,7 @@ from tests.hidden_records import Hidden, expected, records
 
 # A fresh seed each time; set the variable to repeat a run.
 FRESH = int(os.environ.get("EHSVJAX_SEED", secrets.randbelow(2**31)))
+EVERY = 1 if os.environ.get("EHSVJAX_SWEEP") else 8
 # Low noise, so that nearly every plausible size shows in a short record.
 VARIANCE = {"servovalve": 1e-10, "van_der_pol": 1e-4}
 SAMPLES = {"servovalve": 2000, "van_der_pol": 1500}
@@ -56,12 +61,12 @@ def check_found(hidden: Hidden) -> None:
         assert len(found.causes) == 1, said
 
 
-@pytest.mark.parametrize("name", known("van_der_pol"))
+@pytest.mark.parametrize("name", known("van_der_pol")[::EVERY])
 def test_an_effect_of_the_oscillator_is_found(name):
     check_found(Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], (name,), 1))
 
 
-@pytest.mark.parametrize("name", known("servovalve"))
+@pytest.mark.parametrize("name", known("servovalve")[::EVERY])
 def test_an_effect_of_the_servovalve_is_found(name):
     check_found(Hidden("servovalve", "white", VARIANCE["servovalve"], (name,), 1))
 
@@ -72,8 +77,10 @@ def test_an_effect_drawn_afresh_is_found(model):
     check_found(Hidden(model, "white", VARIANCE[model], (name,), FRESH))
 
 
-@pytest.mark.parametrize("kind", ["white", "AR", "quantised", "outliers"])
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize(
+    ("model", "kind"),
+    [("van_der_pol", kind) for kind in ("white", "AR", "quantised", "outliers")] + [("servovalve", "AR")],
+)
 def test_nothing_hidden_is_adequate(model, kind):
     found, _, said = diagnosed(Hidden(model, kind, 100 * VARIANCE[model], (), 2))
     assert found.verdict == "adequate", said
@@ -94,15 +101,10 @@ def test_two_effects_together_are_both_found():
         assert set(pair) <= held(found), said
 
 
-@pytest.mark.parametrize(
-    ("model", "name", "quantity"),
-    [("servovalve", "unknown_cogging", "position"), ("servovalve", "unknown_spool_notch", "opening")],
-)
-def test_an_effect_that_the_bank_lacks_is_unexplained(model, name, quantity):
-    found, _, said = diagnosed(Hidden(model, "white", VARIANCE[model], (name,), 3))
+def test_an_effect_that_the_bank_lacks_is_unexplained():
+    found, _, said = diagnosed(Hidden("servovalve", "white", VARIANCE["servovalve"], ("unknown_spool_notch",), 3))
     assert found.verdict == "unexplained" or not found.innocent, said
     assert found.missing is not None, said
-    del quantity
 
 
 def test_readings_coarser_than_the_noise_are_quantised():

@@ -208,7 +208,7 @@ def missing_term(
 
 def likelihood(left: float, count: int, white: Whitening) -> float:
     """Return twice the logarithm of the likelihood of whitened residuals with this sum of squares, at its best."""
-    return -count * float(np.log(white.noises[0].innovation_variance * left / count)) - count
+    return -float(count * np.log(white.noises[0].innovation_variance * left / count)) - count
 
 
 class _Attempt(NamedTuple):

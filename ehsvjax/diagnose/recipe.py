@@ -215,7 +215,7 @@ def _better_without_form(selection: Selection) -> bool:
     term = missing_term(bench, selection.nominal, white, selection.seen, suspects)
     r = white(selection.final.residual[0])
     numbers = sum(candidate_numbers(bench, i) for i in selection.included)
-    return term.likelihood > likelihood(float(r @ r), len(r), white) - numbers * np.log(len(r))
+    return term.likelihood > likelihood(float(r @ r), len(r), white) - numbers * float(np.log(len(r)))
 
 
 def _verdict(selection: Selection, misfit: Misfit, innocent: bool, shaken: bool, without_form: bool):
