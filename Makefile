@@ -26,6 +26,7 @@ benchmarks: $(VENV)/installed-benchmark
 	$(BIN)/python benchmarks/monte_carlo.py
 	$(BIN)/python benchmarks/wide_bounds.py
 	$(BIN)/python benchmarks/precision.py
+	$(BIN)/python benchmarks/diagnosis.py
 	$(BIN)/python benchmarks/generations_per_second.py
 	$(BIN)/python benchmarks/against_c.py
 	$(BIN)/python benchmarks/scaling.py
