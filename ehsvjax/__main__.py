@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import textwrap
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report = write_report(options.out, oscillator, valve)
     print(f"\nFigures 1, 4 and 5, both tables and {report.name} are in {report.parent.resolve()}")
 
-    print("\nA servovalve whose torque motor sticks: its model does not know, and is asked what it gets wrong")
+    print("\nA servovalve whose torque motor sticks; its model does not know, and is asked what is wrong")
     page = _find_what_is_hidden(jax.random.key(options.seed), options.out)
     print(f"\nOpen {report.resolve()} and {page.resolve()} in a browser. ({time.perf_counter() - began:.0f} s in all)")
 
@@ -66,7 +67,8 @@ def _find_what_is_hidden(key, out: Path) -> Path:
     fit = identify(servovalve(), record, key=search_key, population=50, generations=20)
     print(f"  the model without it fits to {fit.fit_percent['position']:.2f} %")
     diagnosis = diagnose(fit, record, key=diagnosis_key, progress=sys.stderr.isatty())
-    print("\n" + "\n".join(f"  {line}".rstrip() for line in str(diagnosis).splitlines()))
+    for line in str(diagnosis).splitlines():
+        print(textwrap.fill(line.strip(), 100, initial_indent="  ", subsequent_indent="    "))
     (out / "diagnosis.png").write_bytes(to_png(diagnosis.plot(), 110.0))
     diagnosis.report(out / "diagnosis.html")
     return out / "diagnosis.html"
