@@ -1,6 +1,6 @@
 """Are the errors as small as they can be, and the intervals as wide as they should be? Many draws of noise.
 
-    python benchmarks/precision.py [--draws 1000] [--coloured 400] [--profiles 400] [--model both]
+    python benchmarks/precision.py [--draws 1000] [--coloured 400] [--profiles 400] [--model both] [--variance V ...]
 
 The plant is the independent simulator of tests/plants.py. Under white noise of each of the paper's variances: the root
 mean squared error over the Cramer-Rao bound, for the genetic algorithm alone, with refinement, and for the paper's own
@@ -183,6 +183,7 @@ def main() -> None:
     parser.add_argument("--coloured", type=int, default=400, help="under coloured noise")
     parser.add_argument("--profiles", type=int, default=400, help="of each noise at a model's largest variance")
     parser.add_argument("--model", choices=[*EXPERIMENTS, "both"], default="both")
+    parser.add_argument("--variance", type=float, nargs="+", help="only these of the paper's noise variances")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
@@ -193,6 +194,8 @@ def main() -> None:
             if options.model not in (name, "both"):
                 continue
             for variance in make().paper:
+                if options.variance and variance not in options.variance:
+                    continue
                 for pole, draws in ((0.0, options.draws), (POLE, options.coloured)):
                     profiled = min(options.profiles, draws) if variance == max(make().paper) else 0
                     found = gather(pool, name, variance, pole, draws, profiled)
