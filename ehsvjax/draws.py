@@ -19,6 +19,17 @@ from ehsvjax import kernels
 _MOST_IN_A_KERNEL = 16384
 
 
+def check_key(key) -> None:
+    """Refuse what is no random key.
+
+    Raises:
+        ValueError: for anything but `jax.random.key(...)` or `jax.random.PRNGKey(...)`.
+
+    """
+    if not (isinstance(key, jax.Array) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.shape == (2,))):
+        raise ValueError(f"expected key to be a random key such as jax.random.key(0), got {key!r}")
+
+
 def split(key: Key[Array, ""], count: int) -> Key[Array, " count"]:
     """Return new keys, those of `jax.random.split`."""
     generator = jax.random.key_impl(key)

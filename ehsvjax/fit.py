@@ -54,6 +54,11 @@ class History(NamedTuple):
     best: dict[str, Float[np.ndarray, " generation"]]
 
 
+def at_bound(name: str, side: str, what: str = "") -> str:
+    """Return the warning of a fit whose parameter is at its "lower" or "upper" bound."""
+    return f"{name} is at its {side} bound{what}: widen bounds={{{name!r}: ...}} or fix it"
+
+
 class Effort(NamedTuple):
     """What was done for a fit.
 

@@ -12,7 +12,8 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, Key
 
 from ehsvjax import genetic
-from ehsvjax.fit import Effort, Fit, History
+from ehsvjax.draws import check_key
+from ehsvjax.fit import Effort, Fit, History, at_bound
 from ehsvjax.genetic import Operators
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem, cast, population_cost, residuals, shared_cost, to_unit, to_values
@@ -156,8 +157,7 @@ def _check_call(records, key, starts, tolerance):
     if not records or not all(isinstance(record, Record) for record in records):
         kinds = ", ".join(sorted({type(r).__name__ for r in records})) or "none"
         raise ValueError(f"expected a Record or a sequence of Records, got {kinds}: make one with Record.from_csv")
-    if not (isinstance(key, jax.Array) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.shape == (2,))):
-        raise ValueError(f"expected key to be a random key such as jax.random.key(0), got {key!r}")
+    check_key(key)
     if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
         raise ValueError(f"expected starts to be a whole number of at least 1, got {starts!r}")
     if not tolerance >= 0:
@@ -342,7 +342,7 @@ def _warnings(model: Model, problem: Problem, individual, effort: Effort) -> tup
         if min(place, 1.0 - place) < 1e-6:
             side = "lower" if place < 0.5 else "upper"
             what = "" if name in problem.free else " (an initial condition, which this record may hardly show)"
-            found.append(f"{name} is at its {side} bound{what}: widen bounds={{{name!r}: ...}} or fix it")
+            found.append(at_bound(name, side, what))
     if not effort.refined:
         found.append("not refined: the parameters are as good as the search left them; use refine=True")
     elif not effort.converged:

@@ -1,5 +1,6 @@
 """Results as pictures: each function returns a matplotlib figure, which no global state of pyplot knows about."""
 
+import base64
 import functools
 import io
 import math
@@ -187,6 +188,11 @@ def to_png(figure: "matplotlib.figure.Figure", dots_per_inch: float = 110.0) -> 
     figure.savefig(drawn, format="png", dpi=dots_per_inch)
     Image.open(drawn).convert("RGB").quantize(64).save(small, format="png", optimize=True)
     return small.getvalue()
+
+
+def embedded(png: bytes) -> str:
+    """Return a PNG file as an address that an HTML page can hold itself."""
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 def _style():

@@ -1,6 +1,5 @@
 """The paper's figures and tables on one page that needs no other file, written by Jinja2 with every text escaped."""
 
-import base64
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from markupsafe import Markup, escape
 import ehsvjax.paper as paper
 from ehsvjax.models import Model, servovalve, van_der_pol
 from ehsvjax.paper import Identification
-from ehsvjax.plots import plot_identification, plot_pressure_flow, to_png
+from ehsvjax.plots import embedded, plot_identification, plot_pressure_flow, to_png
 
 
 def write_report(
@@ -72,7 +71,7 @@ def _identification_figure(identifications: Sequence[Identification]):
 def _page(pictures: Mapping[str, bytes], **context: Any) -> str:
     environment = Environment(loader=PackageLoader("ehsvjax", "."), autoescape=True, undefined=StrictUndefined)
     environment.filters |= {"number": _number, "signed": _signed, "percent": _percent, "unit": _unit, "symbol": _symbol}
-    images = {name: f"data:image/png;base64,{base64.b64encode(png).decode()}" for name, png in pictures.items()}
+    images = {name: embedded(png) for name, png in pictures.items()}
     return environment.get_template("report.html").render(images=images, **context)
 
 

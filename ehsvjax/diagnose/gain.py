@@ -76,9 +76,8 @@ def _held_back(selection: Selection, added: bool):
     used = selection.white.used.copy()
     used[:, cut:] = False
     white = Whitening(selection.white.noises, used)
-    own = [j for i in (selection.included if added else ()) for j in bench.columns_of(bench.candidates[i])]
     width = selection.final.chosen.shape[1]
-    sets = [bench.base_columns, [*bench.base_columns, *own]]
+    sets = [bench.columns_with(()), bench.columns_with(selection.included if added else ())]
     starts = np.stack([selection.nominal.points[0], (selection.final if added else selection.nominal).points[0]])
     refitted = refit(bench, starts, padded(sets, width), white)
     kept = np.where(samples.measured, 1.0, np.nan)[0, cut:]

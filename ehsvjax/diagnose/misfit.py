@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ehsvjax.diagnose.missing import Dependence, dependences
+from ehsvjax.diagnose.examination import Examination
+from ehsvjax.diagnose.missing import Dependence
 from ehsvjax.diagnose.noise import lattice
-from ehsvjax.diagnose.selection import Selection
 from ehsvjax.precision.residual_noise import residual_noise
 
 _BINS = 12
@@ -76,15 +76,11 @@ class Misfit(NamedTuple):
     tests_after: tuple[Dependence, ...]
 
 
-def misfit_of(
-    selection: Selection, outliers: Bool[np.ndarray, "record time signal"], tests_after: tuple[Dependence, ...]
-) -> Misfit:
+def misfit_of(examined: Examination, outliers: Bool[np.ndarray, "record time signal"]) -> Misfit:
     """Return what the nominal model gets wrong, judged by the noise that the whole diagnosis counts on."""
+    selection = examined.selection
     bench = selection.bench
     samples = bench.problem.samples
-    tests = tests_after
-    if selection.included:
-        tests = dependences(bench, selection.nominal, selection.white, selection.seen)
     outputs = {}
     for i, name in enumerate(bench.problem.observed):
         measured = samples.measured[0, :, i]
@@ -107,7 +103,7 @@ def misfit_of(
             outliers=outliers[0, :, i],
             lattice=lattice(samples.outputs[0, :, i][measured]),
         )
-    return Misfit(outputs, tests, tests_after)
+    return Misfit(outputs, examined.before, examined.after)
 
 
 def _in_time(residual) -> Float[np.ndarray, " window"]:

@@ -15,11 +15,11 @@ from jaxtyping import Float
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.screening import complement
+from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 
 _COARSE = 8
 _FINE = (8, 14, 24, 40)
-_DRAWS = 20_000
 _PROBE = 1e-3
 # Steps of the estimate of a curve, and shares of each step that are simulated.
 _STEPS = 8
@@ -108,11 +108,11 @@ def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
 
 
 def curve_responses(
-    bench: Workbench, current: Refits, seen: Mapping[str, Float[np.ndarray, " time"]]
+    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, " time"]]
 ) -> Float[np.ndarray, "response record time signal"]:
-    """Return what each piece of every curve does to the outputs from the point of a refit."""
+    """Return what each piece of every curve does to the outputs of a point."""
     curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
-    return _responses(bench, current.points[0], curves)
+    return _responses(bench, point, curves)
 
 
 def strongest_dependence(
@@ -134,30 +134,27 @@ def dependences(
         seen: the quantities.
 
     """
-    from scipy.special import chdtrc
-
     curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
     known, r = _unexplained(final, white)
     changes = white(_responses(bench, final.points[0], curves))
     rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
     bases = [_outside(known, part) for part in rows]
-    statistics = [float(np.sum((q.T @ r) ** 2)) for q in bases]
-    along = np.concatenate(bases, axis=1)
-    drawn = np.random.default_rng(1).standard_normal((_DRAWS, along.shape[1])) @ _root(along)
-    p_values, null, column = [], np.ones(_DRAWS), 0
-    for q, statistic in zip(bases, statistics, strict=True):
-        part = drawn[:, column : column + q.shape[1]]
-        column += q.shape[1]
-        p_values.append(float(chdtrc(q.shape[1], statistic)))
-        null = np.minimum(null, chdtrc(q.shape[1], np.sum(part**2, axis=1)))
-    null.sort()
-    found = []
-    for curve, q, statistic, p in zip(curves, bases, statistics, p_values, strict=True):
-        corrected = float(np.searchsorted(null, p, side="right")) / _DRAWS
-        if corrected < 20 / _DRAWS:
-            corrected = min(20 / _DRAWS, len(curves) * p)
-        found.append(Dependence(curve.place, curve.quantity, p, corrected, statistic - q.shape[1]))
+    p_values = [_p_value(q.T @ r) for q in bases]
+    null = smallest_p_values(bases, [_p_value] * len(bases), seed=1)
+    found = [
+        Dependence(
+            curve.place, curve.quantity, float(p), corrected(float(p), null, len(curves)),
+            float(np.sum((q.T @ r) ** 2)) - q.shape[1],
+        )
+        for curve, q, p in zip(curves, bases, p_values, strict=True)
+    ]  # fmt: skip
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
+
+
+def _p_value(components: Float[np.ndarray, "*draw direction"]) -> Float[np.ndarray, "*draw"]:
+    from scipy.special import chdtrc
+
+    return chdtrc(components.shape[-1], np.sum(components**2, axis=-1))
 
 
 def missing_term(
@@ -333,11 +330,6 @@ def _outside(known, responses) -> Float[np.ndarray, "sample independent"]:
     rows = rows - (rows @ known) @ known.T
     vectors, values, _ = np.linalg.svd(rows.T, full_matrices=False)
     return vectors[:, values > 1e-4 * max(values[0], 1e-300)] if len(values) else np.zeros((rows.shape[1], 0))
-
-
-def _root(along) -> Float[np.ndarray, "direction direction"]:
-    values, vectors = np.linalg.eigh(along.T @ along)
-    return (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
 
 
 def _least_squares(rows, r):

@@ -76,11 +76,15 @@ def whitening(noises: Sequence[ResidualNoise], measured: Bool[np.ndarray, "recor
     return Whitening(tuple(noises), used)
 
 
+def plain_noise(variances: Float[np.ndarray, " signal"], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
+    """Return white noise of these variances, in the outputs' units squared: least squares as `identify` does them."""
+    return whitening([ResidualNoise(float("nan"), np.zeros(0), float(v), float(v)) for v in variances], measured)
+
+
 def noise_outside(
     residual: Float[np.ndarray, "record time signal"],
     measured: Bool[np.ndarray, "record time signal"],
     responses: Float[np.ndarray, "response record time signal"],
-    directions: int | None = None,
 ) -> Whitening:
     """Return the noise that is left of a residual outside the space of some responses.
 
@@ -88,15 +92,13 @@ def noise_outside(
         residual: in the outputs' units; anything where nothing is measured.
         measured: where there is a sample.
         responses: of all that may have acted: the model's sensitivities, the candidates' responses.
-        directions: of that space at most, the strongest; None for all that are not negligible.
 
     """
     deviation = np.array([_deviation(residual[..., i][measured[..., i]]) for i in range(residual.shape[-1])])
     standardised = np.where(measured, residual, 0.0) / deviation
-    basis = _basis(np.where(measured, responses, 0.0) / deviation, directions)
+    basis = _basis(np.where(measured, responses, 0.0) / deviation)
     left = standardised - _combined(basis, standardised)
     noises: list[ResidualNoise] | None = None
-    colour = "auto"
     count = int(measured.sum())
     # What the projection took of the noise depends on the noise: three rounds settle it.
     for _ in range(4):
@@ -110,7 +112,7 @@ def noise_outside(
                 absorbed = absorbed_by_the_fit(
                     basis[..., i], measured[..., i], noises[i], np.eye(basis.shape[-2]), inside
                 )
-            noise = residual_noise(left[..., i], measured[..., i], colour, absorbed)
+            noise = residual_noise(left[..., i], measured[..., i], "auto", absorbed)
             if absorbed is None and count > basis.shape[-2]:
                 scale = count / (count - basis.shape[-2])
                 noise = noise._replace(
@@ -128,14 +130,14 @@ def noise_outside(
     return whitening(in_units, measured)
 
 
-def _basis(responses, directions) -> Float[np.ndarray, "record time direction signal"]:
+def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
     """Return orthonormal directions of the responses' space."""
     shape = responses.shape[1:]
     flat = responses.reshape(len(responses), -1)
     norms = np.linalg.norm(flat, axis=1)
     flat = flat[norms > 0] / norms[norms > 0, None]
     values, vectors = np.linalg.svd(flat, full_matrices=False)[1:]
-    kept = vectors[values > _NEGLIGIBLE * values[0]][:directions]
+    kept = vectors[values > _NEGLIGIBLE * values[0]]
     return np.moveaxis(kept.reshape(-1, *shape), 0, 2)
 
 

@@ -1,6 +1,5 @@
 """A diagnosis as one HTML page that needs no other file, written by Jinja2 with every text escaped."""
 
-import base64
 import os
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from ehsvjax.diagnose import words
 from ehsvjax.diagnose.diagnosis import Diagnosis
 from ehsvjax.diagnose.pictures import plot_diagnosis
-from ehsvjax.plots import plot_fit, to_png
+from ehsvjax.plots import embedded, plot_fit, to_png
 
 _HEADS = ("cause", "signal", "size", "unit", "score", "p, whole search", "gain", "smallest to be found", "looks like")
 
@@ -36,16 +35,12 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
         tests=diagnosis.misfit.tests,
         tests_after=diagnosis.misfit.tests_after,
         extended=str(diagnosis.extended),
-        picture=_embedded(to_png(plot_diagnosis(diagnosis))),
-        fitted=_embedded(to_png(plot_fit(diagnosis.extended, diagnosis.record))),
+        picture=embedded(to_png(plot_diagnosis(diagnosis))),
+        fitted=embedded(to_png(plot_fit(diagnosis.extended, diagnosis.record))),
     )
     file = Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(page, encoding="utf-8")
-
-
-def _embedded(png: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
 def _row(row) -> dict:

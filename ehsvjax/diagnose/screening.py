@@ -7,19 +7,23 @@ counts the whole search: it is how often the largest of all candidates' scores i
 the correlated normal numbers), with the frequencies that were searched.
 """
 
+import functools
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnose.frequencies import with_frequencies
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of
+from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import Candidate
 
-_DRAWS = 20_000
+# Of records of noise alone, in which the best of all candidates may pass `Screening.threshold`.
+_FALSE_ALARMS = 1e-3
 # Share of a response that must be left after the refit of the unknowns: below is rounding.
 _SURVIVES = 1e-5
 
@@ -53,7 +57,6 @@ class Screened(NamedTuple):
         response: `[sample]` what the refit of the unknowns cannot do instead, whitened, of unit length.
         strength: deviations of the noise by which the unit of `amount` moves the record.
         amount: of the step, SI, in the first of the effect's numbers.
-        surviving: share of the response that the refit of the unknowns leaves.
 
     """
 
@@ -65,7 +68,6 @@ class Screened(NamedTuple):
     response: Float[np.ndarray, " sample"]
     strength: float
     amount: float
-    surviving: float
 
 
 class Screening(NamedTuple):
@@ -74,14 +76,12 @@ class Screening(NamedTuple):
     Attributes:
         ranked: those whose response survives, the most significant first.
         unseen: positions of candidates whose response does not survive a refit of the unknowns, or is none.
-        responses: `[response, record, time, signal]` of all trials, in the outputs' units.
         threshold: score of a single two-sided candidate that the search exceeds in one of a thousand records of noise.
 
     """
 
     ranked: tuple[Screened, ...]
     unseen: tuple[int, ...]
-    responses: Float[np.ndarray, "response record time signal"]
     threshold: float
 
 
@@ -101,6 +101,7 @@ def responses_at(bench: Workbench, current: Refits, excluded: Collection[int]) -
         excluded: positions of candidates that it includes already.
 
     """
+    bench = with_frequencies(bench, current)
     point = current.points[0]
     here = bench.problem.samples.outputs - current.residual[0]
     trials = [
@@ -176,66 +177,48 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
         rows = np.arange(row, row + len(trial.points))
         row += len(trial.points)
         ok = rows[survives[rows]]
-        bases.append((trial, rows, np.linalg.qr(g[ok].T)[0] if len(ok) else None))
+        bases.append((trial, rows, _basis(g[ok]) if len(ok) else None))
     judged = [(t, rows, q) for t, rows, q in bases if q is not None]
     if not judged:
-        every = tuple(sorted({t.candidate for t in tried.trials}))
-        return Screening((), every, tried.changes, 0.0)
-    along = np.concatenate([q for _, _, q in judged], axis=1)
-    signs = np.concatenate([np.sign(q.T @ g[rows].sum(axis=0)) if q.shape[1] == 1 else np.ones(q.shape[1])
-                            for _, rows, q in judged])  # fmt: skip
-    along = along * signs
-    u = along.T @ r
-    # Noise alone, along all responses at once.
-    spread = np.linalg.qr(along, mode="r")
-    drawn = np.random.default_rng(0).standard_normal((_DRAWS, len(spread))) @ spread
-    p_values, null, column = [], np.ones(_DRAWS), 0
-    for trial, _, q in judged:
-        part = slice(column, column + q.shape[1])
-        column += q.shape[1]
-        p_values.append(_p_value(u[part][None], trial)[0])
-        if q.shape[1] == 1:
-            null = np.minimum(null, _p_value(drawn[:, part], trial))
-    null.sort()
+        return Screening((), tuple(sorted({t.candidate for t in tried.trials})), 0.0)
+    # The frequencies of a harmonic effect were chosen by the residual: they have a correction of their own.
+    single = [(q, functools.partial(_p_value, trial=trial)) for trial, _, q in judged if q.shape[1] == 1]
+    null = smallest_p_values([q for q, _ in single], [p for _, p in single], seed=0)
     best: dict[int, Screened] = {}
-    column = 0
-    for (trial, rows, q), p in zip(judged, p_values, strict=True):
-        part = slice(column, column + q.shape[1])
-        column += q.shape[1]
+    for trial, rows, q in judged:
+        u = q.T @ r
+        p = float(_p_value(u[None], trial)[0])
         harmonic = q.shape[1] > 1
-        if harmonic:
-            corrected = -np.expm1(harmonics * np.log1p(-min(p, 1.0 - 1e-16)))
-        else:
-            # Beyond what was drawn, by Bonferroni's bound.
-            corrected = np.searchsorted(null, p, side="right") / _DRAWS
-            if corrected < 20 / _DRAWS:
-                corrected = min(len(judged) * p, 20 / _DRAWS)
         start, amount, strength = _start(bench, trial, g[rows], r, left[rows])
-        score = float(u[part][0]) if not harmonic else float(np.linalg.norm(u[part]))
         found = Screened(
             candidate=trial.candidate,
-            score=score,
-            p_value=float(p),
-            corrected=float(min(1.0, corrected)),
+            score=float(np.linalg.norm(u)) if harmonic else float(u[0]),
+            p_value=p,
+            corrected=float(-np.expm1(harmonics * np.log1p(-min(p, 1.0 - 1e-16)))) if harmonic
+            else corrected(p, null, len(judged)),
             start=start,
-            response=along[:, part.start] if not harmonic else q @ (q.T @ r) / max(np.linalg.norm(q.T @ r), 1e-300),
+            response=q @ u / max(np.linalg.norm(u), 1e-300) if harmonic else q[:, 0],
             strength=strength,
             amount=amount,
-            surviving=float(left[rows].max() / whole[rows].max()),
-        )
-        # Among trials of one candidate the one that explains most.
+        )  # fmt: skip
         before = best.get(trial.candidate)
         if before is not None:
             # Of all that was tried, the step that shows best tells what could have been seen.
             strongest = float(np.nanmax([found.strength, before.strength, -np.inf]))
             found, before = (s._replace(strength=strongest) for s in (found, before))
             best[trial.candidate] = before
+        # Among trials of one candidate the one that explains most.
         if before is None or (found.p_value, -abs(found.score)) < (before.p_value, -abs(before.score)):
             best[trial.candidate] = found
     ranked = tuple(sorted(best.values(), key=lambda s: (s.p_value, -abs(s.score))))
     unseen = tuple(sorted({t.candidate for t in tried.trials} - set(best)))
-    threshold = float(-ndtri(0.5 * max(null[int(1e-3 * _DRAWS)], 1e-12)))
-    return Screening(ranked, unseen, tried.changes, threshold)
+    return Screening(ranked, unseen, float(-ndtri(0.5 * max(null[int(_FALSE_ALARMS * len(null))], 1e-12))))
+
+
+def _basis(responses: Float[np.ndarray, "step sample"]) -> Float[np.ndarray, "sample step"]:
+    """Return orthonormal directions of a trial's responses; of a single step the way in which it acts."""
+    q = np.linalg.qr(responses.T)[0]
+    return q * np.sign(q.T @ responses[0]) if len(responses) == 1 else q
 
 
 def _p_value(u: Float[np.ndarray, "draw step"], trial: Trial) -> Float[np.ndarray, " draw"]:
@@ -266,8 +249,3 @@ def _start(bench: Workbench, trial: Trial, g, r, left):
     amount = start[columns[0]] * unit[columns[0]]
     strength = float(left[0] / size) if size and np.isfinite(size) else float("nan")
     return start, float(amount), strength
-
-
-def names_of(bench: Workbench, positions: Sequence[int]) -> tuple[str, ...]:
-    """Return the names under which candidates are reported, forms of one effect once."""
-    return tuple(dict.fromkeys(bench.candidates[i].name for i in positions))

@@ -66,6 +66,14 @@ class Workbench:
         """Columns of an effect's numbers."""
         return [self.column[candidate.parameter(p.name)] for p in candidate.effect.parameters]
 
+    def columns_with(self, included: Sequence[int]) -> list[int]:
+        """Columns of the nominal model's unknowns and of some candidates' numbers, by their positions."""
+        return [*self.base_columns, *(j for i in included for j in self.columns_of(self.candidates[i]))]
+
+    def numbers_of(self, candidate: int) -> int:
+        """How many numbers the effect of a candidate has."""
+        return len(self.candidates[candidate].effect.parameters)
+
     def value(self, point: Float[np.ndarray, " parameter"], name: str) -> float:
         """Value of one unknown at a point, SI."""
         return float(to_values(self.problem.coordinates, point)[self.column[name]])
@@ -181,23 +189,11 @@ def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
 
 def _free(candidate: Candidate, number: EffectParameter, model: Model, scales: Scales) -> Parameter:
     """Return an effect's number as a free parameter, between the bounds that make sense at all."""
-    unit = unit_of(candidate, number, model)
+    unit = candidate.unit(number, model)
     lower, upper = number.lower(scales), number.upper(scales)
     value = min(max(0.0, lower), upper)
     name = candidate.parameter(number.name)
     return Parameter(name, name, unit, value, lower, max(upper, lower + 1e-300))
-
-
-def unit_of(candidate: Candidate, number: EffectParameter, model: Model) -> str:
-    """Return the unit of an effect's number at its signal; none where the model is dimensionless there."""
-    unit = _unit(candidate, model)
-    return "" if "{value}" in number.unit and not unit else number.unit.replace("{value}", unit)
-
-
-def _unit(candidate: Candidate, model: Model) -> str:
-    if candidate.effect.kind == "parameter":
-        return model.parameter(candidate.signal).unit
-    return model.unit(candidate.signal)
 
 
 def _filled(rows, count):

@@ -40,12 +40,11 @@ def attach(
             raise ValueError(
                 f"expected bounds of every number of {cause}, {', '.join(own)}; got {', '.join(sorted(given))}"
             )
-        units = {s.name: s.unit for s in model.signals} | {p.name: p.unit for p in model.parameters}
         for p in candidate.effect.parameters:
             name = candidate.parameter(p.name)
             lower, upper = bounds[name]
             absent = p.absent if p.absent is not None else 0.5 * (lower + upper)
-            unit = p.unit.replace("{value}", units[candidate.signal])
+            unit = candidate.unit(p, model)
             numbers[name] = Parameter(name, name, unit, min(max(absent, lower), upper), lower, upper)
     return extended(model, tuple(attached.values()), numbers, duration)
 

@@ -79,6 +79,12 @@ class Candidate(NamedTuple):
         """Name of one of the effect's numbers among the parameters of an extended model."""
         return f"{self.name}.{own}"
 
+    def unit(self, number: EffectParameter, model: Model) -> str:
+        """Unit of one of the effect's numbers; none where the model is dimensionless at the signal."""
+        at_parameter = self.effect.kind == "parameter"
+        unit = model.parameter(self.signal).unit if at_parameter else model.unit(self.signal)
+        return "" if "{value}" in number.unit and not unit else number.unit.replace("{value}", unit)
+
 
 def candidates(
     model: Model, bank: Sequence[Effect], contexts: Mapping[str, Collection[str]], observed: Collection[str]

@@ -48,10 +48,11 @@ def extended(
         Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True),
     )  # fmt: skip
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
+    names = (*effects_of(model), *(c.name for c in attached))
     return replace(
         model,
         signals=(*model.signals, *(Signal(disturbance(place), "input", "") for place in disturbed)),
-        name=f"{model.name.partition(' with ')[0]} with " + ", ".join([*_names(model), *(c.name for c in attached)]),
+        name=f"{model.name.partition(' with ')[0]} with {', '.join(names)}",
         parameters=(*model.parameters, *constants, *own),
         start=equations.start,
         stepper=equations.stepper,
@@ -66,13 +67,9 @@ def disturbance(signal: str) -> str:
     return f"disturbance of {signal}"
 
 
-def _names(model: Model) -> list[str]:
-    return [name for key, names in model.options if key == "effects" for name in names]
-
-
 def effects_of(model: Model) -> tuple[str, ...]:
     """Return the names of the effects that a model was extended by."""
-    return tuple(_names(model))
+    return tuple(name for key, names in model.options if key == "effects" for name in names)
 
 
 @functools.cache

@@ -77,7 +77,8 @@ def _sensor_lag(own, value, context, memory):
     return level, (level, value)
 
 
-def _sensor_play(own, value, context, memory):
+def follow_with_play(own, value, context, memory):
+    """Apply a play of a `half_width`: backlash or hysteresis along the simulation."""
     del context
     level = play(value, memory[0], own["half_width"])
     return level, (level,)
@@ -196,7 +197,7 @@ SENSOR = (
         "sensor_backlash",
         "sensor",
         (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
-        _sensor_play,
+        follow_with_play,
         memory=(0.0,),
         says="the sensor is coupled with play",
         settled_by="small triangles at three rates and amplitudes, with a gauge",

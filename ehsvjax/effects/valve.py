@@ -3,16 +3,10 @@
 import jax.numpy as jnp
 
 from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, limit, size, width
-from ehsvjax.effects.series import dead_zone, play
+from ehsvjax.effects.series import dead_zone, follow_with_play
 
 _TRIANGLES = "small triangles at three rates and amplitudes"
 _STAIRCASE = "a staircase of levels; measure the supply pressure"
-
-
-def _play(own, value, context, memory):
-    del context
-    level = play(value, memory[0], own["half_width"])
-    return level, (level,)
 
 
 def _leaking(own, opening, context):
@@ -40,7 +34,7 @@ VALVE = (
         "torque_motor_hysteresis",
         "drive",
         (width("half_width", "{value}", (0.003, 0.01, 0.03), upper=0.3),),
-        _play,
+        follow_with_play,
         memory=(0.0,),
         says="the torque motor follows its current with a play",
         settled_by=_TRIANGLES,
@@ -49,7 +43,7 @@ VALVE = (
         "feedback_backlash",
         "feedback",
         (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
-        _play,
+        follow_with_play,
         memory=(0.0,),
         says="the feedback follows the piston with a play",
         settled_by=_TRIANGLES,
@@ -92,16 +86,7 @@ VALVE = (
     Effect(
         "flow_gain_rounding",
         "opening",
-        (
-            EffectParameter(
-                "width",
-                "{value}",
-                0.0,
-                constant(0.0),
-                lambda s: 0.3 * s["value"],
-                lambda s: [t * s["value"] for t in (0.003, 0.01, 0.03)],
-            ),
-        ),
+        (width("width", "{value}", (0.003, 0.01, 0.03), upper=0.3),),
         _rounded,
         needs=("spool", "dead_zone", "saturation"),
         says="the lands' edges are round",
@@ -219,7 +204,7 @@ DISPLACEMENT = (
         "backlash",
         "displacement",
         (width("half_width", "{value}", (0.005, 0.02, 0.06)),),
-        _play,
+        follow_with_play,
         memory=(0.0,),
         says="it follows with a play",
         settled_by=_TRIANGLES,

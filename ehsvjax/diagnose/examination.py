@@ -1,0 +1,117 @@
+"""What the causes that were found leave: is it innocent, is it chance, does the bank lack what is missing?"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ehsvjax.diagnose.missing import Dependence, MissingTerm, dependences, likelihood, missing_term
+from ehsvjax.diagnose.noise import Whitening, noise_outside
+from ehsvjax.diagnose.process_noise import CONVINCING, process_noise
+from ehsvjax.diagnose.selection import SIGNIFICANT, Selection
+
+# Dependences that are followed up where something is left.
+_SUSPECTS = 8
+
+
+class Examination(NamedTuple):
+    """What is left of the residual, and of the causes.
+
+    Attributes:
+        selection: with the noise of what is left; without causes if chance, a random force, explains more.
+        before: what the nominal model's residual depends on, the most significant first.
+        after: what the extended model's residual depends on.
+        innocent: whether that is nothing.
+        by_chance: whether a random force explains the nominal model's residual better than any cause.
+        instead: one term of free form that explains more than several causes together; None if none does.
+
+    """
+
+    selection: Selection
+    before: tuple[Dependence, ...]
+    after: tuple[Dependence, ...]
+    innocent: bool
+    by_chance: bool
+    instead: MissingTerm | None
+
+
+def examine(selection: Selection) -> Examination:
+    """Test what a selection leaves, and whether something else explains the record better."""
+    bench = selection.bench
+    after = dependences(bench, selection.final, selection.white, selection.seen)
+    before = after
+    if selection.included:
+        before = dependences(bench, selection.nominal, selection.white, selection.seen)
+    innocent = not _depends(selection, after)
+    selection, by_chance = _random_force(selection, before, innocent)
+    innocent = innocent or by_chance
+    if innocent:
+        selection = replace(selection, white=_own_noise(selection))
+    return Examination(selection, before, after, innocent, by_chance, _instead(selection, before))
+
+
+def remaining_term(examined: Examination) -> MissingTerm:
+    """Return what is missing beside the causes that were found, or in the place of them all."""
+    if examined.instead is not None:
+        return examined.instead
+    selection = examined.selection
+    return missing_term(
+        selection.bench, selection.final, selection.white, selection.seen, examined.after[:_SUSPECTS]
+    )  # fmt: skip
+
+
+def _depends(selection: Selection, tests: tuple[Dependence, ...]) -> bool:
+    """Whether what is left depends on something, also if it is itself taken for coloured noise."""
+    if tests[0].corrected >= SIGNIFICANT:
+        return False
+    own = _own_noise(selection)
+    if not own.coloured:
+        return True
+    return dependences(selection.bench, selection.final, own, selection.seen)[0].corrected < SIGNIFICANT
+
+
+def _own_noise(selection: Selection) -> Whitening:
+    """Return the noise if all that is left is noise."""
+    final = selection.final
+    return noise_outside(final.residual[0], selection.bench.problem.samples.measured, final.slopes[0])
+
+
+def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[Selection, bool]:
+    """Return the selection, and whether a random force explains the nominal model's residual better than any cause.
+
+    Then it is without the causes: what they seemed to explain was the motion that the force had left behind.
+    """
+    bench = selection.bench
+    nominal = process_noise(bench, selection.nominal)
+    if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
+        return selection, False
+    if not innocent:
+        # A term that depends on what runs along the model is a better reason than chance.
+        term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
+        if term.likelihood > nominal.likelihood:
+            return selection, False
+    if not selection.included:
+        return selection, True
+    final = process_noise(bench, selection.final)
+    assert final is not None
+    numbers = _numbers(selection) - 1
+    # Causes that leave nothing unexplained have the first word.
+    margin = CONVINCING if innocent else 0.0
+    if nominal.likelihood - final.of_sensor + numbers * np.log(bench.problem.samples.measured.sum()) > margin:
+        return replace(selection, included=(), final=selection.nominal, rivals=(), gains=()), True
+    return selection, False
+
+
+def _instead(selection: Selection, before: tuple[Dependence, ...]) -> MissingTerm | None:
+    """Return the term of free form that explains the record better than several causes together, if there is one."""
+    if len(selection.included) < 2:
+        return None
+    white = selection.white
+    term = missing_term(selection.bench, selection.nominal, white, selection.seen, before[:_SUSPECTS])
+    r = white(selection.final.residual[0])
+    causes = likelihood(float(r @ r), len(r), white) - _numbers(selection) * float(np.log(len(r)))
+    return term if term.likelihood > causes else None
+
+
+def _numbers(selection: Selection) -> int:
+    return sum(selection.bench.numbers_of(i) for i in selection.included)

@@ -1,0 +1,42 @@
+"""The best of many tests that are alike: how often noise alone would do as well."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+_DRAWS = 20_000
+# Draws below which a share of all draws says little.
+_FEW = 20
+
+
+def smallest_p_values(
+    bases: Sequence[Float[np.ndarray, "sample direction"]],
+    p_values: Sequence[Callable[[Float[np.ndarray, "draw direction"]], Float[np.ndarray, " draw"]]],
+    seed: int,
+) -> Float[np.ndarray, " draw"]:
+    """Return the smallest of all tests' p-values in each of many draws of noise, ascending.
+
+    Args:
+        bases: of each test, the orthonormal directions along which it looks at whitened residuals. Tests of like
+            directions are correlated: all look at the same draw.
+        p_values: of each test, from the components of noise along its directions.
+        seed: of the draws.
+
+    """
+    smallest = np.ones(_DRAWS)
+    if not len(bases):
+        return smallest
+    spread = np.linalg.qr(np.concatenate(bases, axis=1), mode="r")
+    components = np.random.default_rng(seed).standard_normal((_DRAWS, len(spread))) @ spread
+    edges = np.cumsum([basis.shape[1] for basis in bases])[:-1]
+    for part, p_value in zip(np.split(components, edges, axis=1), p_values, strict=True):
+        smallest = np.minimum(smallest, p_value(part))
+    return np.sort(smallest)
+
+
+def corrected(p: float, smallest: Float[np.ndarray, " draw"], tests: int) -> float:
+    """Return how often the best of all tests is as good under noise alone; beyond the draws by Bonferroni's bound."""
+    share = float(np.searchsorted(smallest, p, side="right")) / len(smallest)
+    few = _FEW / len(smallest)
+    return share if share >= few else min(tests * p, few)

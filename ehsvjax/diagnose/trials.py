@@ -1,0 +1,121 @@
+"""Refits of sets of effects: from several starts, and from where a set has been refitted before."""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.diagnose.missing import curve_responses, quantities
+from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit
+from ehsvjax.diagnose.screening import Screened, complement
+from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.effects.effect import UNLIMITED
+
+# Numbers of effects that can be refitted besides the model's unknowns.
+_OWN_NUMBERS = 6
+# Shares of a linear estimate of an effect from which it is refitted too.
+_SHARES = (2.0, 1.4, 0.7, 0.5, 0.35, 0.2, 0.1, 0.02)
+
+
+class Trials(NamedTuple):
+    """What every step of the search for causes needs.
+
+    Attributes:
+        bench: the workbench.
+        seen: what runs along the nominal model and varies, by name.
+        curves: what terms of free form at all places would do to the outputs of the nominal model.
+        reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
+        progress: told of each stage.
+
+    """
+
+    bench: Workbench
+    seen: dict[str, Float[np.ndarray, " time"]]
+    curves: Float[np.ndarray, "response record time signal"]
+    reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
+    progress: Callable[[str], None]
+
+
+def trials_of(bench: Workbench, progress: Callable[[str], None]) -> Trials:
+    """Simulate what terms of free form would do; nothing has been refitted yet."""
+    seen = quantities(bench)
+    return Trials(bench, seen, curve_responses(bench, bench.nominal, seen), {}, progress)
+
+
+def width(bench: Workbench) -> int:
+    """Return how many unknowns are refitted at once, at most."""
+    return len(bench.base_columns) + _OWN_NUMBERS
+
+
+def fits(bench: Workbench, included: Sequence[int]) -> bool:
+    """Whether these effects can be refitted together."""
+    return len(bench.columns_with(included)) <= width(bench)
+
+
+def refit_sets(
+    trials: Trials, starts: Sequence[Float[np.ndarray, " parameter"]], sets: Sequence[Sequence[int]], white: Whitening
+) -> Refits:
+    """Refit each start with its effects, or from where these have been refitted before if that is better."""
+    bench = trials.bench
+    known = [trials.reached.get(frozenset(s)) for s in sets]
+    choices = [[start] if before is None else [start, before] for start, before in zip(starts, known, strict=True)]
+    found = refit(
+        bench, _best_of(bench, choices, white), padded([bench.columns_with(s) for s in sets], width(bench)), white
+    )
+    for point, cost, included in zip(found.points, found.cost, sets, strict=True):
+        if np.isfinite(cost):
+            trials.reached[frozenset(included)] = point
+    return found
+
+
+def refit_screened(
+    trials: Trials, some: Sequence[Screened], rest: Sequence[int], white: Whitening, current: Refits
+) -> Refits:
+    """Refit each screened candidate beside the effects that are there already, from the refit without it."""
+    starts = _best_of(trials.bench, [_starts(trials.bench, s) for s in some], white, current)
+    return refit_sets(trials, list(starts), [(*rest, s.candidate) for s in some], white)
+
+
+def without(
+    bench: Workbench, point: Float[np.ndarray, " parameter"], candidate: int
+) -> Float[np.ndarray, " parameter"]:
+    """Return the point with an effect absent."""
+    own = bench.columns_of(bench.candidates[candidate])
+    point = point.copy()
+    point[own] = bench.nominal[own]
+    return point
+
+
+def _best_of(
+    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], white: Whitening, current: Refits | None = None
+) -> Float[np.ndarray, "individual parameter"]:
+    """Return of each list of points the one that fits best, or would after a linear refit of what `current` has."""
+    if all(len(choice) == 1 for choice in choices):
+        return np.stack([choice[0] for choice in choices])
+    points = np.concatenate([np.stack(choice) for choice in choices])
+    r = white(bench.problem.samples.outputs - bench.simulated(points))
+    if current is not None:
+        known = complement(white(current.slopes[0]))
+        r = r - (r @ known) @ known.T
+    cost = np.sum(r**2, axis=1)
+    cost = np.where(np.isfinite(cost), cost, np.inf)
+    edges = np.cumsum([0, *(len(choice) for choice in choices)])
+    return np.stack([points[a + np.argmin(cost[a:b])] for a, b in itertools.pairwise(edges)])
+
+
+def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " parameter"]]:
+    """Return the start of a candidate, and starts with more or less of the effect, which may be far from linear."""
+    candidate = bench.candidates[screened.candidate]
+    amplitudes = [n for n in candidate.effect.parameters if n.absent is not None and n.absent != UNLIMITED]
+    columns = [bench.column[candidate.parameter(n.name)] for n in amplitudes]
+    absent = np.array([n.absent for n in amplitudes]) / bench.problem.coordinates.upper[columns]
+    lower, upper = bounds_of(bench)
+    starts = [screened.start]
+    for share in _SHARES if columns else ():
+        start = screened.start.copy()
+        start[columns] = np.clip(absent + share * (start[columns] - absent), lower[columns], upper[columns])
+        starts.append(start)
+    return starts

@@ -1,0 +1,47 @@
+"""The verdict: adequate, named, ambiguous or unexplained, with the causes and what could be there instead."""
+
+import numpy as np
+
+from ehsvjax.diagnose.diagnosis import Alternative
+from ehsvjax.diagnose.examination import Examination
+from ehsvjax.diagnose.misfit import Misfit
+from ehsvjax.diagnose.workbench import Workbench
+
+QUANTISATION = "sensor_quantisation"
+PROCESS_NOISE = "process_noise"
+# Share of what could be explained that must be, for causes to be named although something is left.
+_EXPLAINED = 0.9
+# Share of the noise's variance that a lattice of readings must make up to be a cause.
+_COARSE = 0.5
+
+
+def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, ...], tuple[Alternative, ...]]:
+    """Return the verdict, the causes and the alternatives."""
+    selection = examined.selection
+    groups = [
+        tuple(dict.fromkeys(selection.bench.candidates[r.candidate].name for r in selection.rivals[k]))
+        for k in np.argsort([-gain for gain in selection.gains])
+    ]
+    removed = float(selection.nominal.cost[0] - selection.final.cost[0])
+    left = max(examined.after[0].explained, 0.0)
+    explained = removed / max(removed + left, 1e-300)
+    if examined.instead is not None or (not examined.innocent and (not groups or explained < _EXPLAINED)):
+        return "unexplained", (), ()
+    causes = tuple(group[0] for group in groups) + _quantised(misfit) + ((PROCESS_NOISE,) if examined.by_chance else ())
+    if not causes:
+        return "adequate", (), ()
+    alternatives = tuple(Alternative(g, _settled_by(selection.bench, g)) for g in groups if len(g) > 1)
+    return ("ambiguous" if alternatives else "named"), causes, alternatives
+
+
+def _quantised(misfit: Misfit) -> tuple[str, ...]:
+    coarse = [
+        name for name, m in misfit.outputs.items()
+        if m.lattice is not None and m.lattice**2 / 12.0 > _COARSE * m.noise_floor**2
+    ]  # fmt: skip
+    return tuple(QUANTISATION if len(misfit.outputs) == 1 else f"{QUANTISATION}@{name}" for name in coarse)
+
+
+def _settled_by(bench: Workbench, group: tuple[str, ...]) -> str:
+    ways = {c.name: c.effect.settled_by for c in bench.candidates if c.effect.settled_by}
+    return "; ".join(dict.fromkeys(f"{name}: {ways[name]}" for name in group if name in ways))
