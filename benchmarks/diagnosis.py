@@ -30,9 +30,10 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import ehsvjax
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnose import Diagnosis, diagnose
+from ehsvjax.diagnose.missing import MissingTerm
 from tests.hidden_plants import effect_sizes
-from tests.hidden_records import Hidden, expected, records, worth_each
+from tests.hidden_records import TRUTH, Hidden, Made, expected, records, true_term, worth_each
 
 matplotlib.use("Agg")
 
@@ -83,7 +84,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         record = ehsvjax.Record(one.time, {"command": one.command}, {"position": one.position})
         hidden = trial.hidden
         row: dict[str, Any] = {"kind": trial.kind, **hidden._asdict(), "sizes": one.sizes}
-        if trial.kind == "one" and hidden.names != ("process_noise",):
+        if trial.kind in ("one", "unknown") and hidden.names != ("process_noise",):
             row["worth"], row["rival_deficit"], row["rival"] = expected(hidden, one)
         if trial.kind == "two":
             row["worth_each"] = worth_each(hidden, one)
@@ -97,6 +98,10 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
             rows.append(row | {"verdict": "failed", "error": traceback.format_exc(limit=-4)})
             continue
         gain = d.gain.outputs["position"]
+        if trial.kind == "unknown" and d.missing is not None:
+            row["missing_correlation"] = correlation(hidden, one, d.missing)
+        if trial.kind == "one" and d.verdict == "named":
+            row["inside"] = inside(d, hidden)
         rows.append(
             row
             | {
@@ -114,6 +119,26 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
     return rows
 
 
+def correlation(hidden: Hidden, made: Made, missing: MissingTerm) -> float:
+    """Correlate an estimated missing term with the true one along the record; none where the place is wrong."""
+    place, truth = true_term(hidden, made)
+    estimate = missing.series
+    if missing.place == "damping":
+        # As a force: the damping is proportional to 1 - x^2.
+        x = made.clean
+        estimate = (x**2 - (x + estimate) ** 2) * np.gradient(x)
+    # Both openings and supply pressures act on the flow, both damping and forces on the motion.
+    if not any({place, missing.place} <= alike for alike in ({"opening", "supply"}, {"force", "damping"}, {place})):
+        return 0.0
+    return float(np.corrcoef(estimate, truth)[0, 1])
+
+
+def inside(d: Diagnosis, hidden: Hidden) -> list[bool]:
+    """Return for each parameter of the nominal model whether the extended fit's 95% interval holds the truth."""
+    intervals = d.extended.precision().intervals()
+    return [bool(low <= TRUTH[hidden.model][n] <= high) for n, (low, high) in intervals.items() if "." not in n]
+
+
 def base(cause: str) -> str:
     """Name of an effect without its signal."""
     return cause.partition("@")[0]
@@ -122,6 +147,8 @@ def base(cause: str) -> str:
 def outcome(row) -> str:
     """Judge one trial of one or two effects, or of none."""
     truth = set(row["names"])
+    if row["kind"] == "unknown" and row["verdict"] not in ("failed", "unexplained"):
+        return "explained away" if row["innocent"] else "residual not innocent"
     if row["verdict"] in ("failed", "unexplained"):
         return row["verdict"]
     if row["kind"] == "none":
@@ -148,6 +175,12 @@ def summary(table: pd.DataFrame) -> list[str]:
         lines.append(f"one effect, best rival worse by more than {SEPARABLE:g}: {counts(clear)}")
         lines.append(f"one effect, rivals closer: {counts(close)}")
         lines.append(f"process noise: {counts(one[one['rival_deficit'].isna()])}")
+        held = one.loc[one["outcome"] == "named", "inside"].dropna() if "inside" in one else pd.Series()
+        every = [i for row in held for i in row]
+        if every:
+            share, error = 100 * np.mean(every), 100 * np.sqrt(0.95 * 0.05 / len(every))
+            lines.append(f"parameters within their 95% intervals where the effect was named: {share:.1f}% "
+                         f"of {len(every)} (sampling error {error:.1f})")  # fmt: skip
     for kind in ("none", "two", "unknown"):
         some = table[table["kind"] == kind]
         if len(some):
@@ -155,6 +188,12 @@ def summary(table: pd.DataFrame) -> list[str]:
             if kind == "two":
                 seen = some[[worths is not None and min(worths) > SEPARABLE for worths in some["worth_each"]]]
                 lines.append(f"    both worth more than {SEPARABLE:g} beside the other: {counts(seen)}")
+            if kind == "unknown":
+                clear = some[some["rival_deficit"] > SEPARABLE]
+                lines.append(f"    best two of the bank worse by more than {SEPARABLE:g}: {counts(clear)}")
+                told = clear["missing_correlation"].dropna()
+                lines.append(f"    correlation of the missing term with the true one: median {told.median():.2f}, "
+                             f"above 0.9 in {100 * (told > 0.9).mean():.0f}% of {len(told)}")  # fmt: skip
             for noise in some["noise"].unique() if kind == "none" else ():
                 lines.append(f"    {noise}: {counts(some[some['noise'] == noise])}")
     right = table[table["outcome"].isin(["named", "ambiguous, truth within"])]

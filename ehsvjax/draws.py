@@ -26,7 +26,9 @@ def check_key(key) -> None:
         ValueError: for anything but `jax.random.key(...)` or `jax.random.PRNGKey(...)`.
 
     """
-    if not (isinstance(key, jax.Array) and (jnp.issubdtype(key.dtype, jax.dtypes.prng_key) or key.shape == (2,))):
+    typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
+    raw = isinstance(key, jax.Array) and key.dtype == jnp.uint32 and key.shape == (2,)
+    if not (typed or raw):
         raise ValueError(f"expected key to be a random key such as jax.random.key(0), got {key!r}")
 
 

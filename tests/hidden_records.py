@@ -5,6 +5,7 @@ Used by tests and by benchmarks/diagnosis.py; the plants are those of hidden_pla
 
 import functools
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,17 @@ from scipy.signal import lfilter
 from tests.hidden_plants import effect_sizes, held_levels, servovalve_with, van_der_pol_with
 
 EXCITATIONS = 3
+TRUTH = {
+    "servovalve": {
+        "dead_zone": 1e-4,
+        "saturation": 3e-3,
+        "flow_gain": 1.45e-4,
+        "feedback_gain": 0.09,
+        "damping_ratio": 0.72,
+        "natural_frequency": 300.0,
+    },
+    "van_der_pol": {"alpha": 0.96, "gamma": 1.23},
+}
 # Sizes of these are never negative.
 ONE_SIDED = frozenset(
     """
@@ -80,35 +92,54 @@ def plant(model: str, effects: Sequence[Mapping], commands, period, noise=None) 
     return position if noise is None else position + noise
 
 
+class Library(NamedTuple):
+    """What a plant does under an excitation, to first order.
+
+    Attributes:
+        nominal: `[time]` its position without any effect.
+        basis: `[time, direction]` orthonormal directions by its parameters.
+        directions: name of an effect -> `[variant, time]` its directions outside that basis, of unit length: at small,
+            medium and large sizes of both signs.
+
+    """
+
+    nominal: np.ndarray
+    basis: np.ndarray
+    directions: dict[str, np.ndarray]
+
+
 @functools.cache
-def library(model: str, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return a plant's nominal position under an excitation, its directions by parameters, and by each effect."""
+def library(model: str, seed: int, samples: int) -> Library:
+    """Return what a plant could do instead of an effect that is hidden."""
     command, period = excitation(model, seed)
     command = command[:samples]
     ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
-    middle = [
-        {name: {k: (low * high) ** 0.5 if low > 0 else 0.5 * (low + high) for k, (low, high) in numbers.items()}}
+    variants = [
+        (name, {k: sign**(i == 0) * _between(low, high, share) for i, (k, (low, high)) in enumerate(numbers.items())})
         for name, numbers in ranges.items()
-    ]
-    y = plant(model, [{}, *middle], np.tile(command, (len(middle) + 1, 1)), period)
-    truth = (
-        {"dead_zone": 1e-4, "saturation": 3e-3, "flow_gain": 1.45e-4, "feedback_gain": 0.09, "damping_ratio": 0.72,
-         "natural_frequency": 300.0}
-        if model == "servovalve" else {"alpha": 0.96, "gamma": 1.23}
-    )  # fmt: skip
+        for share in (0.1, 0.5, 0.9)
+        for sign in ((1.0,) if name in ONE_SIDED else (1.0, -1.0))
+    ]  # fmt: skip
+    effects = [{}, *({name: sizes} for name, sizes in variants)]
+    y = plant(model, effects, np.tile(command, (len(effects), 1)), period)
     simulate = servovalve_with if model == "servovalve" else van_der_pol_with
     by_parameter = []
-    for name, value in truth.items():
+    for name, value in TRUTH[model].items():
         up, down = (
             simulate([{}], command[None], period, **{name: value * f})["position"][0] for f in (1.0 + 1e-4, 1.0 - 1e-4)
         )
         by_parameter.append(up - down)
     basis = np.linalg.qr(np.array(by_parameter).T)[0]
-    directions = {}
-    for name, row in zip(ranges, y[1:] - y[0], strict=True):
+    directions: dict[str, list[np.ndarray]] = {}
+    for (name, _), row in zip(variants, y[1:] - y[0], strict=True):
         left = row - basis @ (basis.T @ row)
-        directions[name] = left / max(np.linalg.norm(left), 1e-300)
-    return y[0], basis, directions
+        directions.setdefault(name, []).append(left / max(np.linalg.norm(left), 1e-300))
+    return Library(y[0], basis, {name: np.array(rows) for name, rows in directions.items()})
+
+
+def _between(low: float, high: float, share: float) -> float:
+    """Return the size at a share of the way between plausible ones, logarithmic as they are drawn."""
+    return low * (high / low) ** share if low > 0 else low + share * (high - low)
 
 
 class Made(NamedTuple):
@@ -146,33 +177,68 @@ def records(hidden: Sequence[Hidden], samples: int | None = None) -> list[Made]:
 
 
 def expected(hidden: Hidden, made: Made) -> tuple[float, float, str]:
-    """Return the noise variances that the effect is worth, by which its best rival is worse, and that rival."""
-    nominal, basis, directions = library(hidden.model, made.excitation, len(made.time))
-    g = made.clean - nominal
-    g = g - basis @ (basis.T @ g)
+    """Return the noise variances that the effect is worth, by which its best rival is worse, and that rival.
+
+    The rival of an effect that is in no bank may be two effects together.
+    """
+    known = library(hidden.model, made.excitation, len(made.time))
+    g = _outside(known, made.clean - known.nominal)
     worth = float(g @ g) / hidden.variance
     unit = g / max(np.linalg.norm(g), 1e-300)
-    alike = {name: float((unit @ d) ** 2) for name, d in directions.items() if name not in hidden.names}
+    alike = {
+        name: float(np.max((rows @ unit) ** 2)) for name, rows in known.directions.items() if name not in hidden.names
+    }
     rival = max(alike, key=lambda name: alike[name])
+    if all(name.startswith("unknown") for name in hidden.names):
+        both = {pair: _share_of(unit, *(known.directions[name] for name in pair)) for pair in combinations(alike, 2)}
+        pair = max(both, key=lambda pair: both[pair])
+        return worth, worth * (1.0 - both[pair]), " and ".join(pair)
     return worth, worth * (1.0 - alike[rival]), rival
+
+
+def _outside(known: Library, change: np.ndarray) -> np.ndarray:
+    return change - known.basis @ (known.basis.T @ change)
+
+
+def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
+    """Return the share of a direction that two effects take together, each at the best of its sizes."""
+    a, b, c = (first @ unit)[:, None], (second @ unit)[None, :], first @ second.T
+    return float(np.max((a**2 + b**2 - 2.0 * a * b * c) / np.maximum(1.0 - c**2, 1e-6)))
 
 
 def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
     """Return the noise variances that each of several effects is worth beside the others; None with random ones."""
     if "process_noise" in hidden.names:
         return None
-    nominal, basis, _ = library(hidden.model, made.excitation, len(made.time))
+    known = library(hidden.model, made.excitation, len(made.time))
     alone = plant(
         hidden.model,
         [{name: made.sizes[name]} for name in hidden.names],
         np.tile(made.command, (len(hidden.names), 1)),
         excitation(hidden.model, 0)[1],
     )
-    changes = alone - nominal
+    changes = alone - known.nominal
     worths = []
     for i in range(len(changes)):
-        others = np.concatenate([basis, np.delete(changes, i, axis=0).T], axis=1)
+        others = np.concatenate([known.basis, np.delete(changes, i, axis=0).T], axis=1)
         q = np.linalg.qr(others)[0]
         left = changes[i] - q @ (q.T @ changes[i])
         worths.append(float(left @ left) / hidden.variance)
     return tuple(worths)
+
+
+def true_term(hidden: Hidden, made: Made) -> tuple[str, np.ndarray]:
+    """Return where an effect that is in no bank acts, and the term along the record [time]: a force, or a share."""
+    ((name, sizes),) = made.sizes.items()
+    position, period = made.clean, excitation(hidden.model, 0)[1]
+    if name == "unknown_bump":
+        return "force", sizes["force"] * np.exp(-0.5 * ((position - sizes["place"]) / sizes["width"]) ** 2)
+    if name == "unknown_step_damping":
+        return "force", -sizes["coefficient"] * (position > sizes["place"]) * np.gradient(position, period)
+    if name == "unknown_cogging":
+        return "load_force", sizes["force"] * np.sin(2.0 * np.pi * position / sizes["pitch"])
+    spool = servovalve_with([made.sizes], made.command[None], period)["spool"][0]
+    if name == "unknown_spool_notch":
+        opening = np.clip(spool - np.clip(spool, -1e-4, 1e-4), -3e-3, 3e-3)
+        return "opening", -sizes["depth"] * np.exp(-0.5 * ((opening - sizes["place"]) / sizes["width"]) ** 2)
+    return "supply", -sizes["depth"] * np.exp(-0.5 * ((position - sizes["place"]) / sizes["width"]) ** 2)

@@ -1,12 +1,14 @@
 """Effects: absent they change nothing, attached by name they are parameters, and what cannot be meant is refused."""
 
-import jax
+import inspect
+
 import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.effects import BANK, attach, candidates, effects_of
-from ehsvjax.effects.internal import internal_signals
+from ehsvjax.effects import BANK, Effect, amplitude, attach, candidates, effects_of
+from ehsvjax.effects.internal import contexts_of, internal_signals
+from tests.compilations import compilations
 from tests.hidden_plants import held_levels, servovalve_with
 
 TIME = np.arange(300) * 1e-3
@@ -59,31 +61,88 @@ def test_candidates_are_found_from_the_model():
     assert not {"null_bias", "coulomb_friction@load_friction"} & found
 
 
+@pytest.mark.parametrize("make", [ehsvjax.servovalve, ehsvjax.van_der_pol])
+def test_every_effect_of_the_bank_absent_changes_nothing(make):
+    model = make()
+    period = 1e-3 if model.name == "servovalve" else 0.02
+    levels = held_levels(np.random.default_rng(1), 6e-3 if model.name == "servovalve" else 1.0, 3, 100)
+    record = ehsvjax.Record(np.arange(300) * period, {"command": levels})
+    bounds = {}
+    for candidate in candidates(model, BANK, contexts_of(model), model.outputs):
+        for number in candidate.effect.parameters:
+            # The number that makes the effect vanish is where it does; a shape means nothing then.
+            name = candidate.parameter(number.name)
+            at = 1.0 if number.absent is None else number.absent
+            bounds[name] = (at, at + max(1.0, at))
+    extended = attach(model, bounds, duration=300 * period, bank=BANK)
+    nominal, found = ehsvjax.simulate(model, record), ehsvjax.simulate(extended, record)
+    for name in model.outputs:
+        np.testing.assert_allclose(found[name], nominal[name], rtol=1e-5, atol=2e-6 * np.abs(nominal[name]).max())
+
+
+def test_what_is_attached_already_is_no_candidate_and_is_not_attached_again():
+    model = attach(ehsvjax.van_der_pol(), {"cubic_stiffness.coefficient": (0.0, 1.0)}, duration=30.0, bank=BANK)
+    names = {c.name for c in candidates(model, BANK, contexts_of(model), ("position",))}
+    assert "cubic_stiffness" not in names and "sensor_bias" in names
+    assert not any("." in name for name in names)
+    with pytest.raises(ValueError, match="has cubic_stiffness already"):
+        attach(model, {"cubic_stiffness.coefficient": (0.0, 1.0)}, duration=30.0, bank=BANK)
+    with pytest.raises(ValueError, match="counts its drifts, 30.0 s; got 10.0"):
+        attach(model, {"sensor_drift.drift": (0.0, 1.0)}, duration=10.0, bank=BANK)
+
+
+def test_an_effect_that_can_never_vanish_is_refused():
+    with pytest.raises(ValueError, match="cogging to have a number that makes it vanish.*got no number"):
+        Effect("cogging", "force", (), lambda own, force, context: force)
+    with pytest.raises(ValueError, match="its own name, got depth, depth"):
+        Effect("cogging", "force", (amplitude("depth", "N", lambda s: 1.0),) * 2, lambda own, force, context: force)
+
+
 @pytest.mark.parametrize(
     ("bounds", "said"),
     [
-        ({"friktion.force": (0, 1)}, "expected an effect"),
-        ({"cubic_stiffness.coefficient": (0, 1)}, "kind force"),
-        ({"sensor_bias.bias": (0, 1)}, "at which signal"),
-        ({"harmonic_load.cosine": (-1, 1)}, "bounds of every number"),
+        (
+            {"sensor_bais.bias": (-1, 1)},
+            r"an effect and one of its numbers, got sensor_bais\.bias; the bank has ",
+        ),
+        (
+            {"sensor_bias.size": (-1, 1)},
+            r"an effect and one of its numbers, got sensor_bias\.size; the bank has ",
+        ),
+        ({"harmonic_force.sine": (-1, 1)}, "bounds of every number of harmonic_force, cosine, sine, .*; got sine"),
+        ({"null_bias.bias": (-1, 1)}, "expected a signal of Van der Pol oscillator of kind spool for null_bias"),
+        ({"sensor_bias@speed.bias": (-1, 1)}, "expected a signal of Van der Pol oscillator of kind sensor"),
+        ({"parameter_drift.drift": (-1, 1)}, "one of parameter_drift@alpha, parameter_drift@gamma"),
+        ({"structural_flexibility.compliance": (0, 1)}, "load_force"),  # which this model does not pass on
+        ({"sensor_bias.bias": (1, -1)}, r"finite bounds of sensor_bias\.bias with lower < upper, got \(1\.0, -1\.0\)"),
+        ({}, "bounds of an effect's numbers, .*; got none"),
+        ({"transport_delay.delay": (-1.0, 1.0)}, r"transport_delay\.delay to be bounded by zero or more, got .* -1\.0"),
+        ({"sensor_bias.bias": (0, 1), "sensor_bias@position.bias": (0, 1)}, r"bounds of sensor_bias\.bias once"),
+        ({"sensor_bias.bias": (1,)}, r"bounds of sensor_bias\.bias as \(lower, upper\), got \(1,\)"),
+        ({"sensor_bias.bias": 0.1}, r"bounds of sensor_bias\.bias as \(lower, upper\), got 0\.1"),
     ],
 )
 def test_what_cannot_be_attached_is_refused(bounds, said):
-    with pytest.raises(ValueError, match=said):
-        attach(ehsvjax.servovalve(), bounds, duration=1.0, bank=BANK)
+    with compilations() as compiled, pytest.raises(ValueError, match=said):
+        inspect.unwrap(attach)(ehsvjax.van_der_pol(), bounds, duration=30.0, bank=BANK)
+    assert compiled == []
 
 
-def test_what_cannot_be_diagnosed_is_refused():
-    time = np.arange(400) * 0.02
-    command = np.repeat([1.0, -1.0, 0.5, -0.5], 100)
-    model = ehsvjax.van_der_pol()
-    position = ehsvjax.simulate(model, ehsvjax.Record(time, {"command": command}))["position"]
-    record = ehsvjax.Record(time, {"command": command}, {"position": position + 0.01 * np.cos(50.0 * time)})
-    key = jax.random.key(0)
-    fit = ehsvjax.identify(model, record, key=key, population=20, generations=3)
-    with pytest.raises(ValueError, match="hold an output that was fitted"):
-        ehsvjax.diagnose(fit, ehsvjax.Record(time, {"command": command}), key=key)
-    with pytest.raises(ValueError, match="validation to hold an output"):
-        ehsvjax.diagnose(fit, record, ehsvjax.Record(time, {"command": command}), key=key)
-    with pytest.raises(ValueError, match="sequence of effects"):
-        ehsvjax.diagnose(fit, record, key=key, bank=())
+def test_several_signals_that_take_an_effect_are_named_and_one_can_be_chosen():
+    bounds = (-1e-3, 1e-3)
+    with pytest.raises(ValueError, match="one of sensor_bias@position, sensor_bias@spool, sensor_bias@load_pressure"):
+        attach(ehsvjax.servovalve(), {"sensor_bias.bias": bounds}, duration=1.0, bank=BANK)
+    chosen = attach(ehsvjax.servovalve(), {"sensor_bias@spool.bias": bounds}, duration=1.0, bank=BANK)
+    assert effects_of(chosen) == ("sensor_bias@spool",)
+    assert chosen.parameter("sensor_bias@spool.bias").unit == "m"
+
+
+@pytest.mark.parametrize("duration", [0.0, -1.0, np.nan])
+def test_a_duration_that_is_none_is_refused(duration):
+    with pytest.raises(ValueError, match="duration"):
+        attach(ehsvjax.van_der_pol(), {"sensor_drift.drift": (-1.0, 1.0)}, duration=duration, bank=BANK)
+
+
+def test_two_forms_of_one_name_are_attached_together():
+    ends = {"end_stop.positive_end": (0.0, 0.1), "end_stop.negative_end": (0.0, 0.1)}
+    assert set(ends) <= set(attach(ehsvjax.servovalve(), ends, duration=1.0, bank=BANK).free)

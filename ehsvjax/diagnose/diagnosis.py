@@ -45,7 +45,8 @@ class Diagnosis:
         excluded: effects that the record excludes, above which size.
         unseen: effects that the record cannot show at all, whatever their size.
         innocent: whether what the extended model leaves depends on nothing any more.
-        missing: where something is left: the term that is missing, estimated without a form.
+        missing: where something is left, the term that is missing, estimated without a form; where several causes
+            were found, the one term that would explain the record as well, if there is one.
         fit: the fit that was diagnosed.
         record: on which.
 

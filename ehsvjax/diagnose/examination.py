@@ -8,6 +8,7 @@ import numpy as np
 from ehsvjax.diagnose.missing import Dependence, MissingTerm, dependences, likelihood, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside
 from ehsvjax.diagnose.process_noise import CONVINCING, process_noise
+from ehsvjax.diagnose.rivals import INSEPARABLE
 from ehsvjax.diagnose.selection import SIGNIFICANT, Selection
 
 # Dependences that are followed up where something is left.
@@ -23,7 +24,9 @@ class Examination(NamedTuple):
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
         by_chance: whether a random force explains the nominal model's residual better than any cause.
-        instead: one term of free form that explains more than several causes together; None if none does.
+        instead: one term of free form that explains the record as well as several causes together, but for the price
+            of its pieces; None if none does.
+        lacking: whether that term explains more, its price paid: the bank lacks what is missing.
 
     """
 
@@ -33,6 +36,7 @@ class Examination(NamedTuple):
     innocent: bool
     by_chance: bool
     instead: MissingTerm | None
+    lacking: bool
 
 
 def examine(selection: Selection) -> Examination:
@@ -47,12 +51,12 @@ def examine(selection: Selection) -> Examination:
     innocent = innocent or by_chance
     if innocent:
         selection = replace(selection, white=_own_noise(selection))
-    return Examination(selection, before, after, innocent, by_chance, _instead(selection, before))
+    return Examination(selection, before, after, innocent, by_chance, *_instead(selection, before))
 
 
-def remaining_term(examined: Examination) -> MissingTerm:
-    """Return what is missing beside the causes that were found, or in the place of them all."""
-    if examined.instead is not None:
+def remaining_term(examined: Examination) -> MissingTerm | None:
+    """Return what is missing beside the causes that were found, or could be in the place of them all."""
+    if examined.innocent or examined.lacking:
         return examined.instead
     selection = examined.selection
     return missing_term(
@@ -102,15 +106,17 @@ def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent
     return selection, False
 
 
-def _instead(selection: Selection, before: tuple[Dependence, ...]) -> MissingTerm | None:
-    """Return the term of free form that explains the record better than several causes together, if there is one."""
+def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[MissingTerm | None, bool]:
+    """Return a term of free form that explains the record as well as several causes together, and whether better."""
     if len(selection.included) < 2:
-        return None
+        return None, False
     white = selection.white
     term = missing_term(selection.bench, selection.nominal, white, selection.seen, before[:_SUSPECTS])
     r = white(selection.final.residual[0])
-    causes = likelihood(float(r @ r), len(r), white) - _numbers(selection) * float(np.log(len(r)))
-    return term if term.likelihood > causes else None
+    price = float(np.log(len(r)))
+    causes = likelihood(float(r @ r), len(r), white) - _numbers(selection) * price
+    as_well = term.likelihood + len(term.at) * price > causes - INSEPARABLE
+    return (term if as_well else None), term.likelihood > causes
 
 
 def _numbers(selection: Selection) -> int:

@@ -72,7 +72,8 @@ def _held_back(selection: Selection, added: bool):
     """Return residuals before and after, and readings, of the last part; both models refitted to the first alone."""
     bench = selection.bench
     samples = bench.problem.samples
-    cut = round((1.0 - _HELD_BACK) * samples.outputs.shape[1])
+    counted = np.cumsum(samples.measured[0].sum(axis=-1))
+    cut = int(np.searchsorted(counted, (1.0 - _HELD_BACK) * counted[-1]))
     used = selection.white.used.copy()
     used[:, cut:] = False
     white = Whitening(selection.white.noises, used)

@@ -17,8 +17,12 @@ from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.screening import complement
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.models.model import Model
 
-_COARSE = 8
+# Pieces of a curve in the tests; along an output, where a term may repeat over short distances, also this many, if
+# there are so many samples for each.
+_COARSE, _CLOSE = 8, 24
+_SAMPLES_PER_PIECE = 60
 _FINE = (8, 14, 24, 40)
 _PROBE = 1e-3
 # Steps of the estimate of a curve, and shares of each step that are simulated.
@@ -36,6 +40,7 @@ class Dependence(NamedTuple):
         p_value: of no dependence, this test alone.
         corrected: of all such tests together.
         explained: noise variances of the residual's sum of squares that such a term takes, more than noise would give.
+        pieces: of the curve that the term was tried with.
 
     """
 
@@ -44,6 +49,7 @@ class Dependence(NamedTuple):
     p_value: float
     corrected: float
     explained: float
+    pieces: int
 
 
 class MissingTerm(NamedTuple):
@@ -111,8 +117,7 @@ def curve_responses(
     bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, " time"]]
 ) -> Float[np.ndarray, "response record time signal"]:
     """Return what each piece of every curve does to the outputs of a point."""
-    curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
-    return _responses(bench, point, curves)
+    return _responses(bench, point, _tested(bench, seen))
 
 
 def strongest_dependence(
@@ -134,24 +139,24 @@ def dependences(
         seen: the quantities.
 
     """
-    curves = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
+    curves = _tested(bench, seen)
     known, r = _unexplained(final, white)
     changes = white(_responses(bench, final.points[0], curves))
     rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
     bases = [_outside(known, part) for part in rows]
-    p_values = [_p_value(q.T @ r) for q in bases]
+    p_values = [float(_p_value((q.T @ r)[None])[0]) for q in bases]
     null = smallest_p_values(bases, [_p_value] * len(bases), seed=1)
     found = [
         Dependence(
-            curve.place, curve.quantity, float(p), corrected(float(p), null, len(curves)),
-            float(np.sum((q.T @ r) ** 2)) - q.shape[1],
+            curve.place, curve.quantity, p, corrected(p, null, len(curves)),
+            float(np.sum((q.T @ r) ** 2)) - q.shape[1], len(curve.pieces),
         )
         for curve, q, p in zip(curves, bases, p_values, strict=True)
     ]  # fmt: skip
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
 
 
-def _p_value(components: Float[np.ndarray, "*draw direction"]) -> Float[np.ndarray, "*draw"]:
+def _p_value(components: Float[np.ndarray, "draw direction"]) -> Float[np.ndarray, " draw"]:
     from scipy.special import chdtrc
 
     return chdtrc(components.shape[-1], np.sum(components**2, axis=-1))
@@ -170,19 +175,17 @@ def missing_term(
     that then leaves least is it.
     """
     known, r = _unexplained(final, white)
-    attempts = [
-        _settled(bench, final, white, _curve(bench, suspect.place, suspect.quantity, seen, _FINE[0]))
-        for suspect in suspects
-    ]
-    place, quantity = min(attempts, key=lambda a: a.left).curve[:2]
-    best: _Attempt | None = None
-    for pieces in _FINE:
-        attempt = _settled(bench, final, white, _curve(bench, place, quantity, seen, pieces))
-        if best is None or attempt.left + len(attempt.coefficients) * np.log(len(r)) < best.left + len(
-            best.coefficients
-        ) * np.log(len(r)):
-            best = attempt
-    assert best is not None
+
+    def attempted(place, quantity, pieces):
+        return _settled(bench, final, white, _curve(bench, place, quantity, seen, pieces))
+
+    def with_price(attempt):
+        return attempt.left + len(attempt.coefficients) * np.log(len(r))
+
+    attempts = [attempted(s.place, s.quantity, max(s.pieces, _FINE[0])) for s in suspects]
+    first = min(attempts, key=with_price)
+    place, quantity = first.curve[:2]
+    best = min([first, *(attempted(place, quantity, pieces) for pieces in _FINE)], key=with_price)
     curve = best.curve
     probe = _probe(bench, place)
     estimate, deviation = best.coefficients * probe, np.sqrt(np.maximum(np.diag(best.covariance), 0.0)) * probe
@@ -190,9 +193,9 @@ def missing_term(
     taken = float(r @ r) - best.left - len(estimate)
     return MissingTerm(
         place=place,
-        unit="" if curve.relative else _unit(bench, place),
+        unit="" if curve.relative else bench.fit.model.unit(place),
         quantity=quantity,
-        quantity_unit=_quantity_unit(bench, quantity),
+        quantity_unit=quantity_unit(bench.fit.model, quantity),
         at=curve.knots,
         estimate=estimate,
         deviation=deviation,
@@ -261,7 +264,18 @@ def _with_curve(bench: Workbench, points, coefficients, curve: _Curve):
 
 
 def _curve(bench, place, quantity, seen, pieces) -> _Curve:
-    return next(c for c in _curves(bench, place, seen, pieces) if c.quantity == quantity)
+    (curve,) = _curves(bench, place, {quantity: seen[quantity]}, pieces)
+    return curve
+
+
+def _tested(bench, seen) -> list[_Curve]:
+    """Return the curves of all tests."""
+    coarse = [c for place in _places(bench) for c in _curves(bench, place, seen, _COARSE)]
+    pieces = min(_CLOSE, bench.problem.samples.outputs.shape[1] // _SAMPLES_PER_PIECE)
+    if pieces <= _COARSE:
+        return coarse
+    outputs = {name: seen[name] for name in bench.problem.observed if name in seen}
+    return coarse + [c for place in bench.places for c in _curves(bench, place, outputs, pieces)]
 
 
 def _places(bench: Workbench) -> tuple[str, ...]:
@@ -342,12 +356,10 @@ def _least_squares(rows, r):
     return scale * (root @ (vectors.T @ r)), (root @ root.T) * np.outer(scale, scale)
 
 
-def _unit(bench: Workbench, place: str) -> str:
-    return bench.fit.model.unit(place)
-
-
-def _quantity_unit(bench: Workbench, name: str) -> str:
-    if name == TIME:
-        return "s"
-    units = {s.name: s.unit for s in bench.fit.model.signals}
-    return units.get(name, {"velocity": "m/s", "flow": "m^3/s", "load_force": "N"}.get(name, ""))
+def quantity_unit(model: Model, name: str) -> str:
+    """Return the unit of something that runs along a model, a signal or what comes with one."""
+    units = {TIME: "s"} | {s.name: s.unit for s in model.signals}
+    # A dimensionless model has no units but that of time.
+    if model.unit(model.outputs[0]):
+        units = {"velocity": "m/s", "flow": "m^3/s", "load_force": "N"} | units
+    return units.get(name, "")

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ehsvjax.diagnose.diagnosis import Diagnosis
+from ehsvjax.diagnose.missing import quantity_unit
 from ehsvjax.plots import (
     _AXIS,
     _COMMAND,
@@ -35,6 +36,9 @@ def plot_diagnosis(diagnosis: Diagnosis) -> "matplotlib.figure.Figure":
     missing = diagnosis.missing is not None
     with _style():
         figure = _figure(width=10.0, height=4.6 * len(names) + 3.4)
+        causes = " and ".join(_words(cause) for cause in diagnosis.causes)
+        said = f"{diagnosis.verdict}{': ' if causes else ''}{causes}"
+        figure.suptitle(f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {said}")
         parts = figure.subfigures(len(names) + 1, 1, height_ratios=[4.6] * len(names) + [3.4], squeeze=False)[:, 0]
         for part, name in zip(parts, names, strict=False):
             _draw_output(part, diagnosis, name)
@@ -71,7 +75,7 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
     for k, quantity in enumerate(_most_telling(found.against)):
         axes = part.add_subplot(grid[1, k])
         profile = found.against[quantity]
-        across, across_label = _scaled(profile.middle, _unit(diagnosis, quantity))
+        across, across_label = _scaled(profile.middle, quantity_unit(diagnosis.fit.model, quantity))
         mean, mean_label = _scaled(profile.mean, unit)
         axes.fill_between(
             profile.middle / across, -1.96 * profile.deviation / mean, 1.96 * profile.deviation / mean,
@@ -79,7 +83,7 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
         )  # fmt: skip
         axes.plot(profile.middle / across, profile.mean / mean, color=_MEASURED, marker="o", ms=4)
         axes.axhline(0.0, color=_AXIS, lw=0.8)
-        axes.set(xlabel=f"{_words(quantity)} {across_label}", ylabel=f"mean residual {mean_label}" if k == 0 else "")
+        axes.set(xlabel=f"{_words(quantity)} {across_label}", ylabel=f"mean residual {mean_label}")
 
 
 def _most_telling(against) -> list[str]:
@@ -89,12 +93,6 @@ def _most_telling(against) -> list[str]:
         return float(np.mean((profile.mean / profile.deviation) ** 2))
 
     return sorted(against, key=lambda quantity: -excess(against[quantity]))[:_PANELS]
-
-
-def _unit(diagnosis: Diagnosis, quantity: str) -> str:
-    units = {"time": "s", "velocity": "m/s", "flow": "m^3/s", "load_force": "N"}
-    units |= {s.name: s.unit for s in diagnosis.fit.model.signals}
-    return units.get(quantity, "")
 
 
 def _draw_suspects(axes, diagnosis: Diagnosis) -> None:

@@ -1,6 +1,6 @@
 """The recipe of a diagnosis on one screen: refit, screen, search, judge, extend, measure the gain."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import jax
@@ -20,8 +20,13 @@ from ehsvjax.diagnose.workbench import Workbench, workbench
 from ehsvjax.draws import check_key
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
+from ehsvjax.effects.extended import effects_of
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
+from ehsvjax.simulate import input_array
+
+# Fewer cannot tell noise from misfit.
+_LEAST_SAMPLES = 100
 
 
 def diagnose(
@@ -48,20 +53,24 @@ def diagnose(
         progress: print each stage.
 
     Raises:
-        ValueError: for what is no fit, no record or no key, or a record that lacks an input or has no output.
+        ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short, an
+            effect of yours that fits no signal of the model, or one that is in the bank twice.
 
     """
-    _check(fit, record, validation, key, bank)
+    bank = _check_bank(bank)
+    _check(fit, record, validation, key)
     say = _announce if progress else _silent
     say("simulating the model")
-    bench, outliers = _without_spikes(workbench(fit, record, bank))
+    bench = workbench(fit, record, bank)
+    _check_used(bench, bank)
+    bench, outliers = _without_spikes(bench)
     selection = select(bench, say)
     say("testing what is left")
     examined = examine(selection)
     selection = examined.selection
     misfit = misfit_of(examined, outliers)
     verdict, causes, alternatives = verdict_of(examined, misfit)
-    missing = None if verdict != "unexplained" and examined.innocent else remaining_term(examined)
+    missing = remaining_term(examined)
     say("measuring the gain")
     nominal = as_fit(selection, selection.nominal, (), record)
     wider = as_fit(selection, selection.final, selection.included, record)
@@ -96,7 +105,7 @@ def _silent(stage: str) -> None:
     del stage
 
 
-def _check(fit, record, validation, key, bank) -> None:
+def _check(fit, record, validation, key) -> None:
     if not isinstance(fit, Fit):
         raise ValueError(f"expected a fit as identify returns it, got {type(fit).__name__}")
     for name, one in (("record", record), ("validation", validation)):
@@ -113,8 +122,46 @@ def _check(fit, record, validation, key, bank) -> None:
             f"{', '.join(sorted(set(record.outputs) - set(fit.outputs)))}: drop them with .select, or fit them too"
         )
     check_key(key)
-    if not bank or not all(isinstance(effect, Effect) for effect in bank):
-        raise ValueError("expected bank to be a sequence of effects, such as (*ehsvjax.effects.BANK, my_effect)")
+    for one in (record, *([] if validation is None else [validation])):
+        input_array(fit.model, one)
+    measured = min(int(np.isfinite(record.outputs[name]).sum()) for name in record.outputs)
+    if measured < _LEAST_SAMPLES:
+        raise ValueError(
+            f"expected at least {_LEAST_SAMPLES} measured samples of every output of {record.name}, to tell noise "
+            f"from misfit; got {measured}"
+        )
+
+
+def _check_bank(bank) -> tuple[Effect, ...]:
+    """Return the bank as a tuple."""
+    expected = "expected bank to be a sequence of effects, such as (*ehsvjax.effects.BANK, my_effect)"
+    if not isinstance(bank, Iterable):
+        raise ValueError(f"{expected}; got {type(bank).__name__}")
+    bank = tuple(bank)
+    others = [type(effect).__name__ for effect in bank if not isinstance(effect, Effect)]
+    if others or not bank:
+        raise ValueError(f"{expected}; got {', '.join(others) or 'none'} in it")
+    numbers = [(e.name, e.kind, p.name) for e in bank for p in e.parameters]
+    twice = sorted({name for name, kind, number in numbers if numbers.count((name, kind, number)) > 1})
+    if twice:
+        raise ValueError(
+            f"expected every effect of the bank once, got {', '.join(twice)} twice: give yours other names"
+        )
+    return bank
+
+
+def _check_used(bench: Workbench, bank: tuple[Effect, ...]) -> None:
+    """Refuse a user's effect that no signal of the model takes: nothing would have been tried."""
+    tried = {c.effect for c in bench.candidates}
+    there = set(effects_of(bench.fit.model))
+    for effect in bank:
+        if effect not in tried and effect not in BANK and not any(n.partition("@")[0] == effect.name for n in there):
+            signals = ", ".join(f"{s.name} ({s.kind})" for s in bench.fit.model.signals)
+            needs = f" that comes with {', '.join(effect.needs)}" if effect.needs else ""
+            raise ValueError(
+                f"expected a signal of kind {effect.kind}{needs} for {effect.name}; {bench.fit.model.name} has "
+                f"{signals}"
+            )
 
 
 def _without_spikes(bench: Workbench) -> tuple[Workbench, Bool[np.ndarray, "record time signal"]]:

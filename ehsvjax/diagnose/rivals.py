@@ -11,7 +11,7 @@ from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.trials import Trials, fits, refit_screened, refit_sets, without
 from ehsvjax.diagnose.workbench import REFINED_ABREAST
 
-INSEPARABLE = 3.5**2
+INSEPARABLE = 3.0**2
 """Likelihood ratio (noise variances) within which two causes explain a record alike."""
 PER_NUMBER = 4.0
 """Likelihood that each number of an effect must bring, so that more numbers are no advantage."""

@@ -11,8 +11,8 @@ _FEW = 20
 
 
 def smallest_p_values(
-    bases: Sequence[Float[np.ndarray, "sample direction"]],
-    p_values: Sequence[Callable[[Float[np.ndarray, "draw direction"]], Float[np.ndarray, " draw"]]],
+    bases: Sequence[Float[np.ndarray, "sample _"]],
+    p_values: Sequence[Callable[[Float[np.ndarray, "draw _"]], Float[np.ndarray, " draw"]]],
     seed: int,
 ) -> Float[np.ndarray, " draw"]:
     """Return the smallest of all tests' p-values in each of many draws of noise, ascending.

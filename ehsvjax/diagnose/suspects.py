@@ -79,12 +79,13 @@ def table_of(selection: Selection) -> "pandas.DataFrame":
 
 def _detectable(selection: Selection) -> dict[int, float]:
     """Return the smallest size of each candidate, in its first number's unit, that would have been found in 95%."""
-    screening = selection.stages[-1].screening
     found = {}
-    for s in screening.ranked:
-        if np.isfinite(s.strength) and s.strength > 0:
-            needed = np.sqrt(required_gain(selection.bench, screening, s.candidate))
-            found[s.candidate] = (needed + _POWER_QUANTILE) / s.strength
+    # The last look comes last: at a cause the one before it was added.
+    for stage in selection.stages:
+        for s in stage.screening.ranked:
+            if np.isfinite(s.strength) and s.strength > 0:
+                needed = np.sqrt(required_gain(selection.bench, stage.screening, s.candidate))
+                found[s.candidate] = (needed + _POWER_QUANTILE) / s.strength
     return found
 
 

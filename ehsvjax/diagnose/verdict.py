@@ -25,7 +25,7 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
     removed = float(selection.nominal.cost[0] - selection.final.cost[0])
     left = max(examined.after[0].explained, 0.0)
     explained = removed / max(removed + left, 1e-300)
-    if examined.instead is not None or (not examined.innocent and (not groups or explained < _EXPLAINED)):
+    if examined.lacking or (not examined.innocent and (not groups or explained < _EXPLAINED)):
         return "unexplained", (), ()
     causes = tuple(group[0] for group in groups) + _quantised(misfit) + ((PROCESS_NOISE,) if examined.by_chance else ())
     if not causes:

@@ -40,10 +40,10 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what the nominal model gets wrong, a line for each output."""
     lines = []
     for name, m in diagnosis.misfit.outputs.items():
-        unit = diagnosis.fit.model.unit(name)
+        unit = _spaced(diagnosis.fit.model.unit(name))
         kind = "coloured" if m.coloured else "white"
         lines.append(
-            f"{name}: rmse {m.rmse:.4g} {unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
+            f"{name}: rmse {m.rmse:.4g}{unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
             f"{100 * m.above_noise:.1f}% of the squared error is misfit"
         )
         if m.outliers.any():
@@ -51,7 +51,7 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
         if m.lattice is not None:
             share = m.lattice**2 / 12.0 / m.noise_floor**2
             lines.append(
-                f"  the readings lie on a lattice of {m.lattice:.3g} {unit}: {100 * min(share, 1.0):.0f}% of the noise"
+                f"  the readings lie on a lattice of {m.lattice:.3g}{unit}: {100 * min(share, 1.0):.0f}% of the noise"
             )
     first = diagnosis.misfit.tests[0]
     if diagnosis.verdict != "adequate":
@@ -73,17 +73,20 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             if name.startswith(f"{row.cause}.")
         }
         said = ", ".join(
-            f"{name} {value:.4g} {diagnosis.extended.model.parameter(f'{row.cause}.{name}').unit}".rstrip()
+            f"{name} {value:.4g}{_spaced(diagnosis.extended.model.parameter(f'{row.cause}.{name}').unit)}"
             for name, value in numbers.items()
         )
         lines.append(f"{row.cause} at {row.signal}: {said}; without it {row.likelihood_gain:.4g} noise variances worse")
     m = diagnosis.missing
     if m is not None:
-        unit = "of its value" if m.relative else m.unit
+        unit = _spaced("of its value" if m.relative else m.unit)
         peak = int(np.argmax(np.abs(m.estimate)))
+        # Several causes may stand for one that the bank lacks.
+        instead = diagnosis.innocent and diagnosis.verdict != "unexplained"
         lines.append(
-            f"missing at {m.place}, as a function of {m.quantity}: up to {m.estimate[peak]:.3g} +/- "
-            f"{m.deviation[peak]:.2g} {unit} at {m.at[peak]:.3g} {m.quantity_unit} (see .missing and .plot())"
+            f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, as a "
+            f"function of {m.quantity}: up to {m.estimate[peak]:.3g} +/- {m.deviation[peak]:.2g}{unit} at "
+            f"{m.at[peak]:.3g}{_spaced(m.quantity_unit)} (see .missing and .plot())"
         )
     return lines
 
@@ -92,14 +95,14 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what the extension gains, a line for each output."""
     lines = []
     for name, g in diagnosis.gain.outputs.items():
-        unit = diagnosis.fit.model.unit(name)
+        unit = _spaced(diagnosis.fit.model.unit(name))
         if diagnosis.extended.model is diagnosis.fit.model:
             lines.append(
-                f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g} {unit}, noise {g.noise_floor:.4g} {unit}"
+                f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g}{unit}, noise {g.noise_floor:.4g}{unit}"
             )  # fmt: skip
             continue
         line = (
-            f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g} {unit} "
+            f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g}{unit} "
             f"(noise {g.noise_floor:.4g}), fit {g.fit_before:.2f} -> {g.fit_after:.2f}%"
         )
         if np.isfinite(g.share_removed):
@@ -120,7 +123,7 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
     if diagnosis.verdict == "unexplained":
         lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
     if diagnosis.verdict == "adequate":
-        said = "; ".join(f"{e.cause} above {e.above:.2g} {e.unit}".rstrip() for e in diagnosis.excluded[:_NAMED])
+        said = "; ".join(f"{e.cause} above {e.above:.2g}{_spaced(e.unit)}" for e in diagnosis.excluded[:_NAMED])
         more = len(diagnosis.excluded) - _NAMED
         lines.append(
             f"excluded, as it would be found in 95% of such records: {said}"
@@ -129,6 +132,10 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
         if diagnosis.unseen:
             lines.append(f"cannot be seen in this record: {', '.join(diagnosis.unseen)}")
     return lines
+
+
+def _spaced(unit: str) -> str:
+    return f" {unit}" if unit else ""
 
 
 def _p(p: float) -> str:

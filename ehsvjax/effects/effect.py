@@ -67,6 +67,22 @@ class Effect:
     says: str = ""
     settled_by: str = ""
 
+    def __post_init__(self):
+        """Refuse an effect that could never vanish.
+
+        Raises:
+            ValueError: if it has no number that makes it vanish, or two of one name.
+
+        """
+        names = [p.name for p in self.parameters]
+        if all(p.absent is None for p in self.parameters):
+            raise ValueError(
+                f"expected {self.name} to have a number that makes it vanish, such as amplitude(...); got "
+                f"{', '.join(names) or 'no number'}"
+            )
+        if len(set(names)) < len(names):
+            raise ValueError(f"expected every number of {self.name} to have its own name, got {', '.join(names)}")
+
 
 class Candidate(NamedTuple):
     """An effect at one signal of a model, and the name under which it is reported there."""
@@ -91,7 +107,8 @@ def candidates(
 ) -> tuple[Candidate, ...]:
     """Return every effect of the bank at every signal of the model that takes it and could show it.
 
-    Its name is the effect's, followed by `@signal` where more than one signal takes effects of this name.
+    What the model was extended by already is left out. The name of a candidate is the effect's, followed by `@signal`
+    where more than one signal takes effects of this name.
 
     Args:
         model: the model.
@@ -110,7 +127,8 @@ def candidates(
 
     # A valve's flow gain drifts at its opening; to let its other parameters drift, its transfer function would have
     # to be set up anew at every step.
-    drifting = () if any(s.kind == "opening" for s in model.signals) else model.free
+    own = [p for p in model.free if "." not in p]
+    drifting = [] if any(s.kind == "opening" for s in model.signals) else own
     found = []
     for effect in bank:
         places = drifting if effect.kind == "parameter" else [s.name for s in model.signals if takes(effect, s)]
@@ -118,10 +136,12 @@ def candidates(
     places_of: dict[str, set[str]] = {}
     for effect, place in found:
         places_of.setdefault(effect.name, set()).add(place)
-    return tuple(
+    named = [
         Candidate(effect, place, effect.name if len(places_of[effect.name]) == 1 else f"{effect.name}@{place}")
         for effect, place in found
-    )
+    ]
+    there = {p.name for p in model.parameters}
+    return tuple(c for c in named if not {c.parameter(p.name) for p in c.effect.parameters} & there)
 
 
 def constant(value: float) -> Callable[[Scales], float]:

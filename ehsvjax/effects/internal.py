@@ -51,6 +51,15 @@ def internal_signals(
     return Internal(values, contexts)
 
 
+def contexts_of(model: Model) -> dict[str, tuple[str, ...]]:
+    """Return for each signal that a model passes values through the names of the quantities in its context."""
+    contexts: dict[str, tuple[str, ...]] = {}
+    for name in _names_of(model, _watched(model.equations, model.max_step)):
+        signal, quantity = _parts(name)
+        contexts[signal] = (*contexts.get(signal, ()), *((quantity,) if quantity else ()))
+    return contexts
+
+
 def _watch_name(signal: str, quantity: str = "") -> str:
     return f"along {signal}|{quantity}"
 

@@ -181,7 +181,7 @@ class Model:
 
         def changed(p: Parameter) -> Parameter:
             if p.name in bounds:
-                lower, upper = _pair(p.name, bounds[p.name])
+                lower, upper = as_bounds(p.name, bounds[p.name])
                 value = min(max(p.value, lower), upper)
                 # A search over both signs cannot be logarithmic.
                 scale = p.scale if lower > 0 else "linear"
@@ -198,7 +198,13 @@ class Model:
         )
 
 
-def _pair(name: str, bounds: Any) -> tuple[float, float]:
+def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
+    """Return bounds as two numbers.
+
+    Raises:
+        ValueError: if they are no such pair.
+
+    """
     try:
         lower, upper = bounds
         return float(lower), float(upper)
