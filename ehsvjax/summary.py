@@ -51,6 +51,8 @@ class _Section(NamedTuple):
 
 _OUTPUT_HEAD = ("output", "rmse", "fit", "noise standard deviation")
 _PARAMETER_HEAD = ("name", "symbol", "value", "standard error", "unit", "bounds")
+# Share of its value from which an error is large.
+_LARGE = 0.1
 # Correlations that are printed, as in lmfit's reports.
 _LEAST_CORRELATION = 0.5
 _RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
@@ -170,7 +172,12 @@ def _precision_sections(precision: Precision) -> Iterator[_Section]:
             for c in precision.combinations
         ]
         yield _Section("Fixed all the same", fixed)
-    yield _Section("Noise that the errors count on", [(precision.noise,)])
+    rows = [(precision.noise,)]
+    large = [name for name, error in precision.standard_errors.items()
+             if _LARGE * abs(precision.values[name]) < error < math.inf]  # fmt: skip
+    if large:
+        rows.append((f"large errors stretch linear theory: fit.profile_likelihood() for {', '.join(large)}",))
+    yield _Section("Noise that the errors count on", rows)
 
 
 def _direction(direction: Direction) -> str:

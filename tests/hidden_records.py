@@ -99,7 +99,7 @@ class Library(NamedTuple):
         nominal: `[time]` its position without any effect.
         basis: `[time, direction]` orthonormal directions by its parameters.
         directions: name of an effect -> `[variant, time]` its directions outside that basis, of unit length: at small,
-            medium and large sizes of both signs.
+            medium and large sizes.
 
     """
 
@@ -117,8 +117,8 @@ def library(model: str, seed: int, samples: int) -> Library:
     variants = [
         (name, {k: sign**(i == 0) * _between(low, high, share) for i, (k, (low, high)) in enumerate(numbers.items())})
         for name, numbers in ranges.items()
-        for share in (0.1, 0.5, 0.9)
-        for sign in ((1.0,) if name in ONE_SIDED else (1.0, -1.0))
+        for share, sign in ((0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (0.5, -1.0))
+        if sign > 0 or name not in ONE_SIDED
     ]  # fmt: skip
     effects = [{}, *({name: sizes} for name, sizes in variants)]
     y = plant(model, effects, np.tile(command, (len(effects), 1)), period)

@@ -54,6 +54,13 @@ class Page(HTMLParser):
         self.texts.append(data)
 
 
+def test_errors_that_linear_theory_hardly_covers_are_said():
+    precision = hand_made.fit().precision()
+    assert "linear theory" not in str(precision)
+    wide = replace(precision, standard_errors={"gain": 0.11 * precision.values["gain"]})
+    assert "linear theory: fit.profile_likelihood() for gain" in str(wide)
+
+
 def test_text_is_what_a_pencil_gives():
     assert summary(hand_made.fit()) == SUMMARY
 
