@@ -9,7 +9,7 @@ demo: $(VENV)/installed
 	$(BIN)/python -m ehsvjax --out out
 
 test: $(VENV)/installed-test
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist loadgroup
 
 lint: $(VENV)/installed-develop
 	$(BIN)/ruff check .

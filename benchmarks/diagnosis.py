@@ -33,7 +33,7 @@ import ehsvjax
 from ehsvjax.diagnose import Diagnosis, diagnose
 from ehsvjax.diagnose.missing import MissingTerm
 from tests.hidden_plants import effect_sizes
-from tests.hidden_records import TRUTH, Hidden, Made, expected, records, true_term, worth_each
+from tests.hidden_records import TRUTH, Hidden, Made, best_rival, records, true_term, worth, worth_each
 
 matplotlib.use("Agg")
 
@@ -85,7 +85,8 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         hidden = trial.hidden
         row: dict[str, Any] = {"kind": trial.kind, **hidden._asdict(), "sizes": one.sizes}
         if trial.kind in ("one", "unknown") and hidden.names != ("process_noise",):
-            row["worth"], row["rival_deficit"], row["rival"] = expected(hidden, one)
+            row["worth"] = worth(hidden, one)
+            row["rival_deficit"], row["rival"] = best_rival(hidden, one)
         if trial.kind == "two":
             row["worth_each"] = worth_each(hidden, one)
         key = jax.random.key(hidden.seed)

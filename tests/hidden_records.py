@@ -92,27 +92,49 @@ def plant(model: str, effects: Sequence[Mapping], commands, period, noise=None) 
     return position if noise is None else position + noise
 
 
-class Library(NamedTuple):
-    """What a plant does under an excitation, to first order.
+class Nominal(NamedTuple):
+    """A plant without any effect: its position [time], and orthonormal directions by its parameters [time, direction].
 
-    Attributes:
-        nominal: `[time]` its position without any effect.
-        basis: `[time, direction]` orthonormal directions by its parameters.
-        directions: name of an effect -> `[variant, time]` its directions outside that basis, of unit length: at small,
-            medium and large sizes.
-
+    What lies outside those directions no refit of the parameters could do, to first order.
     """
 
-    nominal: np.ndarray
+    position: np.ndarray
     basis: np.ndarray
-    directions: dict[str, np.ndarray]
+
+    def outside(self, position: np.ndarray) -> np.ndarray:
+        """Return what a position [time] has that a refit has not."""
+        change = position - self.position
+        return change - self.basis @ (self.basis.T @ change)
 
 
 @functools.cache
-def library(model: str, seed: int, samples: int) -> Library:
-    """Return what a plant could do instead of an effect that is hidden."""
+def nominal(model: str, seed: int, samples: int) -> Nominal:
+    """Return the plant without any effect under an excitation."""
     command, period = excitation(model, seed)
-    command = command[:samples]
+    simulate = servovalve_with if model == "servovalve" else van_der_pol_with
+
+    def positions(changed):
+        """Simulate with each of some parameters changed in turn; those of a filter are not taken side by side."""
+        count = len(next(iter(changed.values()), [0]))
+        return simulate([{}] * count, np.tile(command[:samples], (count, 1)), period, **changed)["position"]
+
+    truth = TRUTH[model]
+    alone = [name for name in truth if name in ("damping_ratio", "natural_frequency")]
+    together = [name for name in truth if name not in alone]
+    sides = {name: truth[name] * (1.0 + 1e-5 * np.eye(len(together) + 1)[i + 1]) for i, name in enumerate(together)}
+    plain, *moved = positions(sides)
+    moved += [simulate([{}], command[None, :samples], period, **{n: truth[n] * (1.0 + 1e-5)})["position"][0]
+              for n in alone]  # fmt: skip
+    return Nominal(plain, np.linalg.qr((np.array(moved) - plain).T)[0])
+
+
+@functools.cache
+def library(model: str, seed: int, samples: int) -> dict[str, np.ndarray]:
+    """Return what a plant could do instead of an effect that is hidden: by its name [variant, time], of unit length.
+
+    Each effect at small, medium and large sizes, outside what a refit could do.
+    """
+    command, period = excitation(model, seed)
     ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
     variants = [
         (name, {k: sign**(i == 0) * _between(low, high, share) for i, (k, (low, high)) in enumerate(numbers.items())})
@@ -120,21 +142,15 @@ def library(model: str, seed: int, samples: int) -> Library:
         for share, sign in ((0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (0.5, -1.0))
         if sign > 0 or name not in ONE_SIDED
     ]  # fmt: skip
-    effects = [{}, *({name: sizes} for name, sizes in variants)]
-    y = plant(model, effects, np.tile(command, (len(effects), 1)), period)
-    simulate = servovalve_with if model == "servovalve" else van_der_pol_with
-    by_parameter = []
-    for name, value in TRUTH[model].items():
-        up, down = (
-            simulate([{}], command[None], period, **{name: value * f})["position"][0] for f in (1.0 + 1e-4, 1.0 - 1e-4)
-        )
-        by_parameter.append(up - down)
-    basis = np.linalg.qr(np.array(by_parameter).T)[0]
+    y = plant(
+        model, [{name: sizes} for name, sizes in variants], np.tile(command[:samples], (len(variants), 1)), period
+    )
+    without = nominal(model, seed, samples)
     directions: dict[str, list[np.ndarray]] = {}
-    for (name, _), row in zip(variants, y[1:] - y[0], strict=True):
-        left = row - basis @ (basis.T @ row)
+    for (name, _), row in zip(variants, y, strict=True):
+        left = without.outside(row)
         directions.setdefault(name, []).append(left / max(np.linalg.norm(left), 1e-300))
-    return Library(y[0], basis, {name: np.array(rows) for name, rows in directions.items()})
+    return {name: np.array(rows) for name, rows in directions.items()}
 
 
 def _between(low: float, high: float, share: float) -> float:
@@ -176,28 +192,25 @@ def records(hidden: Sequence[Hidden], samples: int | None = None) -> list[Made]:
     return made
 
 
-def expected(hidden: Hidden, made: Made) -> tuple[float, float, str]:
-    """Return the noise variances that the effect is worth, by which its best rival is worse, and that rival.
+def worth(hidden: Hidden, made: Made) -> float:
+    """Return the noise variances that the effects are worth, to first order."""
+    left = nominal(hidden.model, made.excitation, len(made.time)).outside(made.clean)
+    return float(left @ left) / hidden.variance
+
+
+def best_rival(hidden: Hidden, made: Made) -> tuple[float, str]:
+    """Return the noise variances by which the best rival of an effect is worse, to first order, and that rival.
 
     The rival of an effect that is in no bank may be two effects together.
     """
-    known = library(hidden.model, made.excitation, len(made.time))
-    g = _outside(known, made.clean - known.nominal)
-    worth = float(g @ g) / hidden.variance
-    unit = g / max(np.linalg.norm(g), 1e-300)
-    alike = {
-        name: float(np.max((rows @ unit) ** 2)) for name, rows in known.directions.items() if name not in hidden.names
-    }
-    rival = max(alike, key=lambda name: alike[name])
+    left = nominal(hidden.model, made.excitation, len(made.time)).outside(made.clean)
+    unit = left / max(np.linalg.norm(left), 1e-300)
+    every = library(hidden.model, made.excitation, len(made.time))
+    rivals = {(name,): float(np.max((every[name] @ unit) ** 2)) for name in every if name not in hidden.names}
     if all(name.startswith("unknown") for name in hidden.names):
-        both = {pair: _share_of(unit, *(known.directions[name] for name in pair)) for pair in combinations(alike, 2)}
-        pair = max(both, key=lambda pair: both[pair])
-        return worth, worth * (1.0 - both[pair]), " and ".join(pair)
-    return worth, worth * (1.0 - alike[rival]), rival
-
-
-def _outside(known: Library, change: np.ndarray) -> np.ndarray:
-    return change - known.basis @ (known.basis.T @ change)
+        rivals = {pair: _share_of(unit, *(every[name] for name in pair)) for pair in combinations(every, 2)}
+    rival = max(rivals, key=lambda names: rivals[names])
+    return worth(hidden, made) * (1.0 - rivals[rival]), " and ".join(rival)
 
 
 def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
@@ -210,17 +223,17 @@ def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
     """Return the noise variances that each of several effects is worth beside the others; None with random ones."""
     if "process_noise" in hidden.names:
         return None
-    known = library(hidden.model, made.excitation, len(made.time))
+    without = nominal(hidden.model, made.excitation, len(made.time))
     alone = plant(
         hidden.model,
         [{name: made.sizes[name]} for name in hidden.names],
         np.tile(made.command, (len(hidden.names), 1)),
         excitation(hidden.model, 0)[1],
     )
-    changes = alone - known.nominal
+    changes = alone - without.position
     worths = []
     for i in range(len(changes)):
-        others = np.concatenate([known.basis, np.delete(changes, i, axis=0).T], axis=1)
+        others = np.concatenate([without.basis, np.delete(changes, i, axis=0).T], axis=1)
         q = np.linalg.qr(others)[0]
         left = changes[i] - q @ (q.T @ changes[i])
         worths.append(float(left @ left) / hidden.variance)

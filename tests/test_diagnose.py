@@ -15,6 +15,8 @@ import ehsvjax
 from ehsvjax.effects import BANK, amplitude, attach, effects_of
 from tests.compilations import compilations
 
+# One process compiles.
+pytestmark = pytest.mark.xdist_group("diagnoses of the oscillator")
 PERIOD, SAMPLES, HELD = 0.05, 600, 20
 TIME = np.arange(SAMPLES) * PERIOD
 TRUTH = {"alpha": 0.96, "gamma": 1.23}

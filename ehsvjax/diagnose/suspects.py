@@ -90,6 +90,7 @@ def _detectable(selection: Selection) -> dict[int, float]:
 
 
 def excluded_by(selection: Selection, causes: tuple[str, ...]) -> tuple[Excluded, ...]:
+    """Return the effects that a record excludes above a size, those that are its causes aside."""
     bench = selection.bench
     least: dict[str, Excluded] = {}
     for i, above in _detectable(selection).items():
@@ -105,6 +106,7 @@ def excluded_by(selection: Selection, causes: tuple[str, ...]) -> tuple[Excluded
 
 
 def unseen_by(selection: Selection, causes: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the effects that a record can't show whatever their size, those that are its causes aside."""
     bench = selection.bench
     known = {e.cause for e in excluded_by(selection, causes)} | set(causes)
     limits = {c.name for c in bench.candidates if any(p.absent == UNLIMITED for p in c.effect.parameters)}
