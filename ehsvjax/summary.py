@@ -172,12 +172,12 @@ def _precision_sections(precision: Precision) -> Iterator[_Section]:
             for c in precision.combinations
         ]
         yield _Section("Fixed all the same", fixed)
-    rows = [(precision.noise,)]
+    noise: list[tuple[str, ...]] = [(precision.noise,)]
     large = [name for name, error in precision.standard_errors.items()
              if _LARGE * abs(precision.values[name]) < error < math.inf]  # fmt: skip
     if large:
-        rows.append((f"large errors stretch linear theory: fit.profile_likelihood() for {', '.join(large)}",))
-    yield _Section("Noise that the errors count on", rows)
+        noise.append((f"large errors stretch linear theory: fit.profile_likelihood() for {', '.join(large)}",))
+    yield _Section("Noise that the errors count on", noise)
 
 
 def _direction(direction: Direction) -> str:

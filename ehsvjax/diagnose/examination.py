@@ -48,7 +48,8 @@ def examine(selection: Selection) -> Examination:
         before = dependences(bench, selection.nominal, selection.white, selection.seen)
     innocent = not _depends(selection, after)
     selection, by_chance = _random_force(selection, before, innocent)
-    innocent = innocent or by_chance
+    if by_chance:
+        innocent, after = True, before
     if innocent:
         selection = replace(selection, white=_own_noise(selection))
     return Examination(selection, before, after, innocent, by_chance, *_instead(selection, before))
@@ -102,7 +103,7 @@ def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent
     # Causes that leave nothing unexplained have the first word.
     margin = CONVINCING if innocent else 0.0
     if nominal.likelihood - final.of_sensor + numbers * np.log(bench.problem.samples.measured.sum()) > margin:
-        return replace(selection, included=(), final=selection.nominal, rivals=(), gains=()), True
+        return selection.without_causes(), True
     return selection, False
 
 

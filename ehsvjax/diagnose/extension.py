@@ -62,8 +62,6 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
 
 
 def _unweighted(selection: Selection, refits: Refits, included: tuple[int, ...]) -> Refits:
-    if not selection.white.coloured:
-        return refits
     bench = selection.bench
     variances = np.array(list(_variances(selection, refits).values()))
     columns = padded([bench.columns_with(included)], refits.chosen.shape[1])

@@ -51,11 +51,10 @@ def gain_of(
     extended: Fit,
     validation: Record | None,
     rng: np.random.Generator,
-    added: bool = True,
 ) -> Gain:
     """Return the gain on a validation record, or on the last part of the record, held back from both refits."""
     if validation is None:
-        before, after, measured, on = _held_back(selection, added)
+        before, after, measured, on = _held_back(selection)
     else:
         residuals = [fit.residuals(validation) for fit in (nominal, extended)]
         names = [n for n in selection.bench.problem.observed if n in validation.outputs]
@@ -68,7 +67,7 @@ def gain_of(
     )  # fmt: skip
 
 
-def _held_back(selection: Selection, added: bool):
+def _held_back(selection: Selection):
     """Return residuals before and after, and readings, of the last part; both models refitted to the first alone."""
     bench = selection.bench
     samples = bench.problem.samples
@@ -78,9 +77,9 @@ def _held_back(selection: Selection, added: bool):
     used[:, cut:] = False
     white = Whitening(selection.white.noises, used)
     width = selection.final.chosen.shape[1]
-    sets = [bench.columns_with(()), bench.columns_with(selection.included if added else ())]
-    starts = np.stack([selection.nominal.points[0], (selection.final if added else selection.nominal).points[0]])
-    refitted = refit(bench, starts, padded(sets, width), white)
+    sets = [bench.columns_with(()), bench.columns_with(selection.included)]
+    starts = np.stack([selection.nominal.points[0], selection.final.points[0]])
+    refitted = refit(bench, starts, padded(sets, width), white, race=False)
     kept = np.where(samples.measured, 1.0, np.nan)[0, cut:]
     before, after = (refitted.residual[k, 0, cut:] * kept for k in (0, 1))
     readings = samples.outputs[0, cut:] * kept
@@ -95,6 +94,10 @@ def _held_back(selection: Selection, added: bool):
 
 def _gain(before, after, readings, noise_variance, rng) -> OutputGain:
     kept = np.isfinite(before) & np.isfinite(after)
+    if not kept.any():
+        # Of several outputs one may not have been measured there.
+        nothing = float("nan")
+        return OutputGain(*(nothing,) * 4, noise_variance**0.5, nothing, (nothing, nothing))
     before, after, readings = before[kept], after[kept], readings[kept]
     about_mean = float(np.mean((readings - readings.mean()) ** 2))
     squares = np.stack([before**2, after**2], axis=1)
@@ -105,7 +108,8 @@ def _gain(before, after, readings, noise_variance, rng) -> OutputGain:
     if removable > 4.0 * noise_variance * np.sqrt(2.0 / len(before)):
         share = float((mean[0] - mean[1]) / removable)
         drawn = _redrawn(squares, rng)
-        shares = (drawn[:, 0] - drawn[:, 1]) / np.maximum(drawn[:, 0] - noise_variance, 1e-300)
+        # What is removable is taken as it is: a misfit that is short would be in few of the drawn blocks.
+        shares = (drawn[:, 0] - drawn[:, 1]) / removable
         low, high = (float(q) for q in np.quantile(shares, [0.025, 0.975]))
     rmse, fits = np.sqrt(mean), 100.0 * (1.0 - np.sqrt(mean / about_mean))
     return OutputGain(

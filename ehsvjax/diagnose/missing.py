@@ -124,7 +124,8 @@ def strongest_dependence(
     bench: Workbench, current: Refits, white: Whitening, seen: Mapping[str, Float[np.ndarray, " time"]]
 ) -> float:
     """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
-    return max(d.explained for d in dependences(bench, current, white, seen))
+    _, bases, r = _examined(bench, current, white, seen)
+    return max(float(np.sum((q.T @ r) ** 2)) - q.shape[1] for q in bases)
 
 
 def dependences(
@@ -139,11 +140,7 @@ def dependences(
         seen: the quantities.
 
     """
-    curves = _tested(bench, seen)
-    known, r = _unexplained(final, white)
-    changes = white(_responses(bench, final.points[0], curves))
-    rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
-    bases = [_outside(known, part) for part in rows]
+    curves, bases, r = _examined(bench, final, white, seen)
     p_values = [float(_p_value((q.T @ r)[None])[0]) for q in bases]
     null = smallest_p_values(bases, [_p_value] * len(bases), seed=1)
     found = [
@@ -154,6 +151,16 @@ def dependences(
         for curve, q, p in zip(curves, bases, p_values, strict=True)
     ]  # fmt: skip
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
+
+
+def _examined(bench: Workbench, final: Refits, white: Whitening, seen):
+    """Return the curves that could show at all, orthonormal directions of each, and the residual, all whitened."""
+    curves = _tested(bench, seen)
+    known, r = _unexplained(final, white)
+    changes = white(_responses(bench, final.points[0], curves))
+    rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
+    shown = [(curve, q) for curve, part in zip(curves, rows, strict=True) if (q := _outside(known, part)).shape[1]]
+    return [curve for curve, _ in shown], [q for _, q in shown], r
 
 
 def _p_value(components: Float[np.ndarray, "draw direction"]) -> Float[np.ndarray, " draw"]:

@@ -70,7 +70,8 @@ def whitening(noises: Sequence[ResidualNoise], measured: Bool[np.ndarray, "recor
     for i, noise in enumerate(noises):
         order = len(noise.coefficients)
         for lag in range(1, order + 1):
-            used[:, lag:, i] &= measured[:, :-lag, i]
+            if noise.coefficients[lag - 1] != 0.0:
+                used[:, lag:, i] &= measured[:, :-lag, i]
         # The first samples are made white together.
         used[:, :order, i] &= measured[:, :order, i].all(axis=1, keepdims=True)
     return Whitening(tuple(noises), used)
@@ -167,7 +168,8 @@ def spikes(
         spread = 1.4826 * np.median(np.abs(differences - np.median(differences))) if len(differences) else 0.0
         if spread == 0.0:
             continue
-        alone = [_alone(series[..., i], _SPIKE * spread) for series in (residual, outputs)]
+        seen = (np.where(measured[..., i], series[..., i], np.nan) for series in (residual, outputs))
+        alone = [_alone(series, _SPIKE * spread) for series in seen]
         found[..., i] = alone[0] & alone[1] & measured[..., i]
     return found
 
@@ -196,4 +198,4 @@ def lattice(values: Float[np.ndarray, " time"]) -> float | None:
     multiples = gaps / step
     step = float(np.sum(gaps) / np.sum(np.round(multiples)))
     off = np.abs(gaps / step - np.round(gaps / step))
-    return step if np.max(off) < 1e-3 * np.max(multiples) + 1e-3 else None
+    return step if np.max(off) < min(1e-3 * np.max(multiples) + 1e-3, 0.05) else None

@@ -78,8 +78,9 @@ def diagnose(
     gain = gain_of(selection, nominal, wider, validation, rng)
     if verdict == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
         # What was added on the way to no explanation does not predict: it is left out again.
-        wider = nominal
-        gain = gain_of(selection, nominal, wider, validation, rng, added=False)
+        selection, wider = selection.without_causes(), nominal
+        gain = gain_of(selection, nominal, wider, validation, rng)
+    suspected = tuple(dict.fromkeys([*causes, *(name for group in alternatives for name in group.causes)]))
     return Diagnosis(
         verdict=verdict,
         causes=causes,
@@ -88,8 +89,8 @@ def diagnose(
         extended=wider,
         gain=gain,
         misfit=misfit,
-        excluded=excluded_by(selection, causes),
-        unseen=unseen_by(selection, causes),
+        excluded=() if verdict == "unexplained" else excluded_by(selection, suspected),
+        unseen=unseen_by(selection, suspected),
         innocent=examined.innocent,
         missing=missing,
         fit=fit,

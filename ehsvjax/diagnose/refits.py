@@ -25,7 +25,7 @@ class Refits(NamedTuple):
         residual: measured minus simulated there, in the outputs' units.
         slopes: derivatives of the outputs by the chosen unknowns there; zero along padding.
         chosen: `[individual, direction]` the unknowns' columns; -1 is padding.
-        converged: whether another step would gain less than a hundredth of the noise's variance.
+        converged: whether another step would gain less than a hundredth of the residuals' variance.
 
     """
 
@@ -66,6 +66,7 @@ def refit(
     chosen: Int[np.ndarray, "individual direction"],
     white: Whitening,
     iterations: int = _ITERATIONS,
+    race: bool = True,
 ) -> Refits:
     """Refit the chosen unknowns of every start.
 
@@ -78,6 +79,7 @@ def refit(
         chosen: columns of the unknowns of each start; -1 is padding.
         white: of the noise.
         iterations: at most this many steps.
+        race: whether the starts compete: what is far behind the best is given up.
 
     """
     lower, upper = bounds_of(bench)
@@ -118,7 +120,7 @@ def refit(
             if gain < 0.01 * max(cost[i] / whitened.shape[1], 1e-300):
                 converged[i] = True
                 running[i] = False
-            elif damping[i] > 1e12 or (iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
+            elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
                 running[i] = False
             trial[i] = points[i] + step
     shape = bench.problem.samples.outputs.shape

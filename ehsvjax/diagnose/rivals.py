@@ -12,10 +12,16 @@ from ehsvjax.diagnose.trials import Trials, fits, refit_screened, refit_sets, wi
 from ehsvjax.diagnose.workbench import REFINED_ABREAST
 
 INSEPARABLE = 3.0**2
-"""Likelihood ratio (noise variances) within which two causes explain a record alike."""
+"""Likelihood ratio (noise variances) of two refits within which they explain a record alike.
+
+Where the true cause can be expected to be 5^2 better than a rival, chance brings the refits as near as 3^2 in 2% of
+all records (3.5^2 in 7%); a rival that is 3^2 better than the true cause is as rare as three standard deviations.
+"""
 PER_NUMBER = 4.0
 """Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
 _SWAPS = 3
+# Noise variances by which a refit has to be better than another to take its place.
+_LOWER = 0.1
 # Deficit to first order of a rival that is refitted, however many there are; a large effect is not of first order.
 _WORTH_A_REFIT = 100.0
 
@@ -39,8 +45,10 @@ def rivals_of_all(
             rest = tuple(j for j in included if j != i)
             group = _rivals_of(trials, i, rest, final, white)
             groups.append(group)
-            if group[0].candidate != i and attempt < _SWAPS:
-                better = (tuple(group[0].candidate if j == i else j for j in included), group[0].refitted)
+            first = group[0]
+            lower = float(first.refitted.cost[0]) < float(final.cost[0]) - _LOWER
+            if (first.candidate != i or lower) and attempt < _SWAPS:
+                better = (tuple(first.candidate if j == i else j for j in included), first.refitted)
                 break
         if better is None:
             break

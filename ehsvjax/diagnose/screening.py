@@ -20,7 +20,7 @@ from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
-from ehsvjax.effects.effect import Candidate
+from ehsvjax.effects.effect import UNLIMITED, Candidate
 
 # Of records of noise alone, in which the best of all candidates may pass `Screening.threshold`.
 _FALSE_ALARMS = 1e-3
@@ -36,6 +36,7 @@ class Trial(NamedTuple):
         points: `[step, parameter]` where each step leads.
         one_sided: whether the effect can only act in this direction.
         proportional: whether half the step would do half as much.
+        harmonic: whether its frequency was chosen by the residual.
 
     """
 
@@ -43,6 +44,7 @@ class Trial(NamedTuple):
     points: Float[np.ndarray, "step parameter"]
     one_sided: bool
     proportional: bool
+    harmonic: bool
 
 
 class Screened(NamedTuple):
@@ -55,7 +57,8 @@ class Screened(NamedTuple):
         corrected: of the whole search.
         start: `[parameter]` the point from which to refit it.
         response: `[sample]` what the refit of the unknowns cannot do instead, whitened, of unit length.
-        strength: deviations of the noise by which the unit of `amount` moves the record.
+        shown: sizes of the effect, of `amount`'s unit, that were tried, and the deviations of the noise by which each
+            moves the record; a single one if the response is proportional to the size; none for a limit.
         amount: of the step, SI, in the first of the effect's numbers.
 
     """
@@ -66,7 +69,7 @@ class Screened(NamedTuple):
     corrected: float
     start: Float[np.ndarray, " parameter"]
     response: Float[np.ndarray, " sample"]
-    strength: float
+    shown: tuple[tuple[float, float], ...]
     amount: float
 
 
@@ -133,11 +136,16 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
                 moved[row, j] = value / bench.problem.coordinates.upper[j]
             first = bench.column[candidate.parameter(amplitudes[0].name)]
             tried = amplitudes[0].tries(scales)
-            one_sided = len(amplitudes) == 1 and (amplitudes[0].absent != 0.0 or lower[first] >= 0.0)
-            proportional = len(tried) == 1
-            if amplitudes[0].absent == 1.0:
-                one_sided = False
-            found.append(Trial(position, moved, one_sided, proportional))
+            limited = amplitudes[0].absent == UNLIMITED or (amplitudes[0].absent == 0.0 and lower[first] >= 0.0)
+            found.append(
+                Trial(
+                    position,
+                    moved,
+                    one_sided=len(amplitudes) == 1 and limited,
+                    proportional=len(tried) == 1,
+                    harmonic=candidate.effect.harmonic,
+                )
+            )
     return found
 
 
@@ -182,30 +190,30 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
     if not judged:
         return Screening((), tuple(sorted({t.candidate for t in tried.trials})), 0.0)
     # The frequencies of a harmonic effect were chosen by the residual: they have a correction of their own.
-    single = [(q, functools.partial(_p_value, trial=trial)) for trial, _, q in judged if q.shape[1] == 1]
+    single = [(q, functools.partial(_p_value, trial=trial)) for trial, _, q in judged if not trial.harmonic]
     null = smallest_p_values([q for q, _ in single], [p for _, p in single], seed=0)
     best: dict[int, Screened] = {}
     for trial, rows, q in judged:
         u = q.T @ r
         p = float(_p_value(u[None], trial)[0])
-        harmonic = q.shape[1] > 1
-        start, amount, strength = _start(bench, trial, g[rows], r, left[rows])
+        several = q.shape[1] > 1
+        start, amount, shown = _start(bench, trial, g[rows], r, left[rows])
         found = Screened(
             candidate=trial.candidate,
-            score=float(np.linalg.norm(u)) if harmonic else float(u[0]),
+            score=float(np.linalg.norm(u)) if several else float(u[0]),
             p_value=p,
-            corrected=float(-np.expm1(harmonics * np.log1p(-min(p, 1.0 - 1e-16)))) if harmonic
+            corrected=float(-np.expm1(harmonics * np.log1p(-min(p, 1.0 - 1e-16)))) if trial.harmonic
             else corrected(p, null, len(judged)),
             start=start,
-            response=q @ u / max(np.linalg.norm(u), 1e-300) if harmonic else q[:, 0],
-            strength=strength,
+            response=q @ u / max(np.linalg.norm(u), 1e-300) if several else q[:, 0],
+            shown=shown,
             amount=amount,
         )  # fmt: skip
         before = best.get(trial.candidate)
         if before is not None:
-            # Of all that was tried, the step that shows best tells what could have been seen.
-            strongest = float(np.nanmax([found.strength, before.strength, -np.inf]))
-            found, before = (s._replace(strength=strongest) for s in (found, before))
+            # What each step would show tells what could have been seen, whichever explains most.
+            every = tuple(sorted({*found.shown, *before.shown}))
+            found, before = (s._replace(shown=every) for s in (found, before))
             best[trial.candidate] = before
         # Among trials of one candidate the one that explains most.
         if before is None or (found.p_value, -abs(found.score)) < (before.p_value, -abs(before.score)):
@@ -232,7 +240,7 @@ def _p_value(u: Float[np.ndarray, "draw step"], trial: Trial) -> Float[np.ndarra
 
 
 def _start(bench: Workbench, trial: Trial, g, r, left):
-    """Return the point from which to refit, the first amplitude there, SI, and the strength of one unit of it."""
+    """Return the point from which to refit, the first amplitude there, SI, and what the step shows of which size."""
     candidate = bench.candidates[trial.candidate]
     amplitudes = [n for n in candidate.effect.parameters if n.absent is not None]
     columns = [bench.column[candidate.parameter(n.name)] for n in amplitudes]
@@ -245,7 +253,7 @@ def _start(bench: Workbench, trial: Trial, g, r, left):
         lower, upper = bounds_of(bench)
         for j, step, nothing, factor in zip(columns, steps, absent, factors, strict=True):
             start[j] = np.clip(nothing + factor * step, lower[j], upper[j])
-    size = abs(steps[0] * unit[columns[0]]) if abs(steps[0]) < 1e29 else float("nan")
     amount = start[columns[0]] * unit[columns[0]]
-    strength = float(left[0] / size) if size and np.isfinite(size) else float("nan")
-    return start, float(amount), strength
+    if amplitudes[0].absent == UNLIMITED or not steps[0]:
+        return start, float(amount), ()
+    return start, float(amount), ((float(abs(steps[0] * unit[columns[0]])), float(left[0])),)

@@ -1,7 +1,7 @@
 """The search for causes: add the one that explains most, refit, look again; then its rivals, swaps and deletions."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +60,10 @@ class Selection:
     rivals: tuple[tuple[Rival, ...], ...]
     gains: tuple[float, ...]
 
+    def without_causes(self) -> "Selection":
+        """Return it with the nominal model alone."""
+        return replace(self, included=(), final=self.nominal, rivals=(), gains=())
+
 
 def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
     """Search for the causes of what a fit leaves of a record.
@@ -84,8 +88,8 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
     if set(included) != set(last.included):
         last = _look(trials, included, final)
         final = last.current
-    nominal = refit_sets(trials, [stages[0].current.points[0]], [()], last.white)
     while True:
+        nominal = refit_sets(trials, [stages[0].current.points[0]], [()], last.white)
         gains, needless = _gains(trials, included, final, nominal, last)
         if needless is None:
             break
@@ -100,8 +104,7 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
 
 def required_gain(bench: Workbench, screening: Screening, candidate: int) -> float:
     """Return the likelihood ratio that an effect must bring, in noise variances, for the search that found it."""
-    effect = bench.candidates[candidate].effect
-    if any(n.name == "frequency" for n in effect.parameters):
+    if bench.candidates[candidate].effect.harmonic:
         frequencies = bench.problem.samples.measured.sum() / 2
         return float(2.0 * np.log(frequencies / SIGNIFICANT)) + PER_NUMBER
     return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
@@ -181,13 +184,13 @@ def _is_gain(trials: Trials, stage: Stage, extended: Refits, candidate: int) -> 
 
 
 def _gains(trials: Trials, included, final: Refits, nominal: Refits, last: Stage):
-    """Return how much worse the fit is without each effect, and the first that is not needed beside the others."""
-    gains, needless = [], None
+    """Return how much worse the fit is without each effect, and the one that is needed least, if it is needless."""
+    gains, spare = [], {}
     for i in included:
         rest = tuple(j for j in included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
         gain = float(refit_sets(trials, [start], [rest], last.white).cost[0] - final.cost[0])
         gains.append(gain)
-        if len(included) > 1 and needless is None and gain < required_gain(trials.bench, last.screening, i):
-            needless = i
-    return gains, needless
+        spare[i] = gain - required_gain(trials.bench, last.screening, i)
+    least = min(spare, key=lambda i: spare[i], default=None)
+    return gains, least if len(included) > 1 and least is not None and spare[least] < 0.0 else None

@@ -1,5 +1,6 @@
 """All candidates in a table, and what a record excludes or cannot show."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -83,10 +84,28 @@ def _detectable(selection: Selection) -> dict[int, float]:
     # The last look comes last: at a cause the one before it was added.
     for stage in selection.stages:
         for s in stage.screening.ranked:
-            if np.isfinite(s.strength) and s.strength > 0:
-                needed = np.sqrt(required_gain(selection.bench, stage.screening, s.candidate))
-                found[s.candidate] = (needed + _POWER_QUANTILE) / s.strength
-    return found
+            needed = np.sqrt(required_gain(selection.bench, stage.screening, s.candidate)) + _POWER_QUANTILE
+            found[s.candidate] = _least_size(s.shown, float(needed))
+    for i in selection.stages[-1].screening.unseen:
+        found.pop(i, None)
+    return {i: size for i, size in found.items() if np.isfinite(size)}
+
+
+def _least_size(shown: Sequence[tuple[float, float]], needed: float) -> float:
+    """Return the size that moves the record by so many deviations of the noise; +inf if none that was tried does."""
+    if len(shown) == 1:
+        ((size, deviations),) = shown
+        return size * needed / deviations if deviations > 0 else float("inf")
+    # Not proportional: between sizes that were tried, on logarithmic scales; nothing is claimed below the least.
+    before = None
+    for size, deviations in shown:
+        if deviations >= needed:
+            if before is None or before[1] <= 0:
+                return size
+            share = np.log(needed / before[1]) / np.log(deviations / before[1])
+            return float(before[0] * (size / before[0]) ** share)
+        before = (size, deviations)
+    return float("inf")
 
 
 def excluded_by(selection: Selection, causes: tuple[str, ...]) -> tuple[Excluded, ...]:

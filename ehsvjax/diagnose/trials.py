@@ -56,15 +56,21 @@ def fits(bench: Workbench, included: Sequence[int]) -> bool:
 
 
 def refit_sets(
-    trials: Trials, starts: Sequence[Float[np.ndarray, " parameter"]], sets: Sequence[Sequence[int]], white: Whitening
+    trials: Trials,
+    starts: Sequence[Float[np.ndarray, " parameter"]],
+    sets: Sequence[Sequence[int]],
+    white: Whitening,
+    race: bool = False,
 ) -> Refits:
-    """Refit each start with its effects, or from where these have been refitted before if that is better."""
+    """Refit each start with its effects, or from where these have been refitted before if that is better.
+
+    In a race, what falls far behind the best is given up.
+    """
     bench = trials.bench
     known = [trials.reached.get(frozenset(s)) for s in sets]
     choices = [[start] if before is None else [start, before] for start, before in zip(starts, known, strict=True)]
-    found = refit(
-        bench, _best_of(bench, choices, white), padded([bench.columns_with(s) for s in sets], width(bench)), white
-    )
+    columns = padded([bench.columns_with(s) for s in sets], width(bench))
+    found = refit(bench, _best_of(bench, choices, white), columns, white, race=race)
     for point, cost, included in zip(found.points, found.cost, sets, strict=True):
         if np.isfinite(cost):
             trials.reached[frozenset(included)] = point
@@ -76,7 +82,7 @@ def refit_screened(
 ) -> Refits:
     """Refit each screened candidate beside the effects that are there already, from the refit without it."""
     starts = _best_of(trials.bench, [_starts(trials.bench, s) for s in some], white, current)
-    return refit_sets(trials, list(starts), [(*rest, s.candidate) for s in some], white)
+    return refit_sets(trials, list(starts), [(*rest, s.candidate) for s in some], white, race=True)
 
 
 def without(

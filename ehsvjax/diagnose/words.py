@@ -66,7 +66,7 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
     lines = []
     included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
-    for row in included.itertuples():
+    for row in included.drop_duplicates("cause").itertuples():
         numbers = {
             name.removeprefix(f"{row.cause}."): value
             for name, value in diagnosis.extended.parameters.items()

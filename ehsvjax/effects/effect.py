@@ -11,6 +11,8 @@ Scales = Mapping[str, Any]
 context by name (0 where nothing is known), `duration` and `sample_period` in s, `frequencies` in rad/s at which the
 residual is strongest, and `modulations`, at which its product with the motion is."""
 
+ALWAYS = ("time", "step_size", "duration")
+"""Quantities that every effect's context has."""
 UNLIMITED = 1e30
 """A limit that nothing reaches."""
 
@@ -67,6 +69,11 @@ class Effect:
     says: str = ""
     settled_by: str = ""
 
+    @property
+    def harmonic(self) -> bool:
+        """Whether one of its numbers is a frequency that has to be found."""
+        return any(p.name == "frequency" for p in self.parameters)
+
     def __post_init__(self):
         """Refuse an effect that could never vanish.
 
@@ -122,7 +129,7 @@ def candidates(
         if signal.kind != effect.kind or (signal.kind == "sensor" and signal.name not in observed):
             return False
         return signal.kind == "input" or (
-            signal.name in contexts and set(effect.needs) <= set(contexts[signal.name])
+            signal.name in contexts and set(effect.needs) <= {*contexts[signal.name], *ALWAYS}
         )  # fmt: skip
 
     # A valve's flow gain drifts at its opening; to let its other parameters drift, its transfer function would have
@@ -141,7 +148,13 @@ def candidates(
         for effect, place in found
     ]
     there = {p.name for p in model.parameters}
-    return tuple(c for c in named if not {c.parameter(p.name) for p in c.effect.parameters} & there)
+
+    def has(candidate):
+        # The name says the signal only where there was a choice, which depends on the outputs that are measured.
+        names = (candidate.effect.name, f"{candidate.effect.name}@{candidate.signal}")
+        return any(f"{name}.{p.name}" in there for name in names for p in candidate.effect.parameters)
+
+    return tuple(c for c in named if not has(c))
 
 
 def constant(value: float) -> Callable[[Scales], float]:

@@ -1,0 +1,151 @@
+"""The parts of a diagnosis that can be told from numbers alone: spikes, lattices, whitening, significance, gain."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.stats import norm
+
+from ehsvjax.diagnose.gain import _gain
+from ehsvjax.diagnose.noise import lattice, noise_outside, plain_noise, spikes, whitening
+from ehsvjax.diagnose.significance import corrected, smallest_p_values
+from ehsvjax.diagnose.suspects import _least_size
+from ehsvjax.precision.residual_noise import ResidualNoise
+
+
+def series(values):
+    return np.asarray(values, float)[None, :, None]
+
+
+def two_sided(components):
+    return 2.0 * norm.sf(np.abs(components[:, 0]))
+
+
+# --- Spikes and lattices ---
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
+def test_readings_beside_gaps_are_no_spikes_and_spikes_are_found(share):
+    rng = np.random.default_rng(0)
+    clean = np.sin(np.arange(2000) / 30.0)
+    noisy = clean + rng.normal(0.0, 0.01, 2000)
+    measured = series(rng.random(2000) >= share).astype(bool)
+    readings = series(np.where(measured[0, :, 0], noisy, 0.0))
+    assert not spikes(readings - series(clean), measured, readings).any()
+    at = np.flatnonzero(measured[0, :, 0])[[50, 400, 401, 700]]
+    readings[0, at, 0] += [0.4, 0.5, -0.5, 0.3]
+    found = spikes(readings - series(clean), measured, readings)
+    # Where most neighbours are missing, a reading cannot be said to stand alone.
+    assert set(np.flatnonzero(found[0, :, 0])) <= set(at)
+    if share == 0.0:
+        assert set(np.flatnonzero(found[0, :, 0])) == set(at)
+
+
+def test_a_step_is_no_spike():
+    readings = series(np.repeat([0.0, 1.0, 0.0], [50, 1, 50]) + np.repeat([0.0, 5.0], [70, 31]))
+    readings += np.random.default_rng(1).normal(0.0, 0.01, readings.shape)
+    found = spikes(readings, np.ones(readings.shape, bool), readings)
+    assert np.flatnonzero(found[0, :, 0]).tolist() == [50]
+
+
+@given(step=st.floats(1e-6, 1e3), offset=st.floats(-10.0, 10.0), seed=st.integers(0, 1000))
+def test_the_step_of_a_lattice_is_found(step, offset, seed):
+    levels = np.random.default_rng(seed).integers(-12, 12, 500)
+    found = lattice(step * (levels + offset))
+    assert found == pytest.approx(step, rel=1e-3)
+
+
+def test_held_levels_are_no_lattice():
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        assert lattice(np.repeat(rng.uniform(-1.0, 1.0, 25), 200)) is None
+    assert lattice(rng.normal(size=1000)) is None
+
+
+# --- Noise ---
+
+
+def test_whitened_noise_is_white_also_at_its_beginning():
+    poles = np.array([1.0, -0.7])
+    many = lfilter([1.0], poles, np.random.default_rng(3).standard_normal((4000, 220)), axis=1)[:, 200:]
+    noise = ResidualNoise(0.0, np.array([0.7]), 1.0 / (1.0 - 0.49), 1.0)
+    white = whitening([noise], np.ones((1, 20, 1), bool))
+    found = white(many[:, None, :, None])
+    assert found.shape == (4000, 20)
+    np.testing.assert_allclose(np.cov(found.T), np.eye(20), atol=0.1)
+
+
+def test_an_output_sampled_at_every_other_step_can_be_whitened():
+    measured = np.zeros((1, 100, 1), bool)
+    measured[0, ::2] = True
+    noise = ResidualNoise(0.0, np.array([0.0, 0.9]), 1.0 / (1.0 - 0.81), 1.0)
+    assert whitening([noise], measured).used.sum() >= 48
+
+
+def test_misfit_inside_the_span_is_not_taken_for_coloured_noise():
+    rng = np.random.default_rng(4)
+    misfit = np.sin(np.arange(1500) / 40.0)
+    residual = series(misfit + rng.normal(0.0, 0.1, 1500))
+    measured = np.ones(residual.shape, bool)
+    found = noise_outside(residual, measured, series(misfit)[None])
+    assert not found.coloured
+    assert found.noises[0].variance == pytest.approx(0.01, rel=0.15)
+    assert noise_outside(residual, measured, series(np.ones(1500))[None]).coloured
+
+
+def test_plain_noise_weights_each_output_by_its_deviation():
+    white = plain_noise(np.array([4.0, 0.25]), np.ones((1, 3, 2), bool))
+    np.testing.assert_allclose(white(np.ones((1, 3, 2))), [0.5] * 3 + [2.0] * 3)
+
+
+# --- Significance ---
+
+
+def test_the_smallest_of_independent_p_values_is_corrected_as_sidak_says():
+    count = 20
+    null = smallest_p_values(list(np.eye(count)[:, :, None]), [two_sided] * count, seed=0)
+    for p in (0.001, 0.01, 0.05):
+        assert corrected(p, null, count) == pytest.approx(1.0 - (1.0 - p) ** count, abs=0.01)
+
+
+def test_the_same_test_many_times_over_needs_no_correction():
+    null = smallest_p_values([np.eye(5)[:, :1]] * 50, [two_sided] * 50, seed=0)
+    assert corrected(0.01, null, 50) == pytest.approx(0.01, abs=0.003)
+
+
+def test_beyond_what_was_drawn_bonferroni_bounds():
+    null = smallest_p_values(list(np.eye(10)[:, :, None]), [two_sided] * 10, seed=0)
+    assert corrected(1e-12, null, 10) == pytest.approx(1e-11)
+
+
+# --- Sizes and gain ---
+
+
+def test_the_least_size_is_linear_for_a_proportional_effect():
+    assert _least_size([(2.0, 10.0)], 5.0) == pytest.approx(1.0)
+    assert _least_size([], 5.0) == np.inf
+
+
+def test_nothing_is_claimed_below_the_least_size_that_was_tried():
+    # An effect that grows with the square of its size.
+    shown = [(s, 100.0 * s**2) for s in (0.5, 1.0, 2.0)]
+    assert _least_size(shown, 4.0) == 0.5
+    assert _least_size(shown, 150.0) == pytest.approx(1.5**0.5)
+    assert _least_size(shown, 1e4) == np.inf
+
+
+def test_an_output_without_readings_has_no_gain():
+    nothing = np.full(100, np.nan)
+    found = _gain(nothing, nothing, nothing, 0.01, np.random.default_rng(0))
+    assert np.isnan(found.rmse_before) and np.isnan(found.share_removed) and found.noise_floor == 0.1
+
+
+def test_a_misfit_in_one_place_leaves_the_interval_of_the_gain_finite():
+    rng = np.random.default_rng(5)
+    after = rng.normal(0.0, 0.1, 2000)
+    before = after + np.where(np.arange(2000) < 100, 1.0, 0.0)
+    found = _gain(before, after, np.sin(np.arange(2000) / 50.0), 0.01, rng)
+    assert found.share_removed == pytest.approx(1.0, abs=0.05)
+    low, high = found.share_interval
+    assert 0.0 <= low <= found.share_removed <= high < 5.0
