@@ -182,8 +182,9 @@ def records(hidden: Sequence[Hidden], samples: int | None = None) -> list[Made]:
         float(rng.uniform(0.2, 2.0)) * h.variance**0.5 if h.noise == "quantised" else 0.0
         for h, rng in zip(hidden, rngs, strict=True)
     ]
-    measured = plant(model, effects, commands, period, noises)
-    clean = plant(model, effects, commands, period)
+    # With noise and without, side by side.
+    both = np.concatenate([noises, np.zeros_like(noises)])
+    measured, clean = np.split(plant(model, effects * 2, np.tile(commands, (2, 1)), period, both), 2)
     made = []
     for i, step in enumerate(steps):
         position = step * np.round(measured[i] / step) if step else measured[i]
