@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from ehsvjax.diagnose.gain import Gain
 from ehsvjax.diagnose.misfit import Misfit
 from ehsvjax.diagnose.missing import MissingTerm
+from ehsvjax.diagnose.process_noise import ProcessNoise
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
 
@@ -47,6 +48,7 @@ class Diagnosis:
         innocent: whether what the extended model leaves depends on nothing any more.
         missing: where something is left, the term that is missing, estimated without a form; where several causes
             were found, the one term that would explain the record as well, if there is one.
+        process_noise: the random force that was found, if it is the cause.
         fit: the fit that was diagnosed.
         record: on which.
 
@@ -63,6 +65,7 @@ class Diagnosis:
     unseen: tuple[str, ...]
     innocent: bool
     missing: MissingTerm | None
+    process_noise: ProcessNoise | None
     fit: Fit
     record: Record
 

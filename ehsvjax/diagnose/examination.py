@@ -7,7 +7,7 @@ import numpy as np
 
 from ehsvjax.diagnose.missing import Dependence, MissingTerm, dependences, likelihood, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside
-from ehsvjax.diagnose.process_noise import CONVINCING, process_noise
+from ehsvjax.diagnose.process_noise import CONVINCING, ProcessNoise, process_noise
 from ehsvjax.diagnose.rivals import INSEPARABLE
 from ehsvjax.diagnose.selection import SIGNIFICANT, Selection
 
@@ -23,7 +23,7 @@ class Examination(NamedTuple):
         before: what the nominal model's residual depends on, the most significant first.
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
-        by_chance: whether a random force explains the nominal model's residual better than any cause.
+        chance: the random force that explains the nominal model's residual better than any cause; None if none does.
         instead: one term of free form that explains the record as well as several causes together, but for the price
             of its pieces; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -34,7 +34,7 @@ class Examination(NamedTuple):
     before: tuple[Dependence, ...]
     after: tuple[Dependence, ...]
     innocent: bool
-    by_chance: bool
+    chance: ProcessNoise | None
     instead: MissingTerm | None
     lacking: bool
 
@@ -47,12 +47,12 @@ def examine(selection: Selection) -> Examination:
     if selection.included:
         before = dependences(bench, selection.nominal, selection.white, selection.seen)
     innocent = not _depends(selection, after)
-    selection, by_chance = _random_force(selection, before, innocent)
-    if by_chance:
-        innocent, after = True, before
+    chance = _random_force(selection, before, innocent)
+    if chance is not None:
+        selection, after, innocent = selection.without_causes(), before, True
     if innocent:
         selection = replace(selection, white=_own_noise(selection))
-    return Examination(selection, before, after, innocent, by_chance, *_instead(selection, before))
+    return Examination(selection, before, after, innocent, chance, *_instead(selection, before))
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
@@ -81,30 +81,30 @@ def _own_noise(selection: Selection) -> Whitening:
     return noise_outside(final.residual[0], selection.bench.problem.samples.measured, final.slopes[0])
 
 
-def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[Selection, bool]:
-    """Return the selection, and whether a random force explains the nominal model's residual better than any cause.
+def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> ProcessNoise | None:
+    """Return the random force that explains the nominal model's residual better than any cause, if there is one.
 
-    Then it is without the causes: what they seemed to explain was the motion that the force had left behind.
+    What the causes seemed to explain was then the motion that the force had left behind.
     """
     bench = selection.bench
     nominal = process_noise(bench, selection.nominal)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
-        return selection, False
+        return None
     if not innocent:
         # A term that depends on what runs along the model is a better reason than chance.
         term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
         if term.likelihood > nominal.likelihood:
-            return selection, False
+            return None
     if not selection.included:
-        return selection, True
+        return nominal
     final = process_noise(bench, selection.final)
     assert final is not None
     numbers = _numbers(selection) - 1
     # Causes that leave nothing unexplained have the first word.
     margin = CONVINCING if innocent else 0.0
     if nominal.likelihood - final.of_sensor + numbers * np.log(bench.problem.samples.measured.sum()) > margin:
-        return selection.without_causes(), True
-    return selection, False
+        return nominal
+    return None
 
 
 def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[MissingTerm | None, bool]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of
-from ehsvjax.diagnose.screening import complement
+from ehsvjax.diagnose.screening import span
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.models.model import Model
@@ -339,7 +339,7 @@ def _responses(bench: Workbench, point, curves: Sequence[_Curve]) -> Float[np.nd
 
 
 def _unexplained(final: Refits, white: Whitening):
-    known = complement(white(final.slopes[0]))
+    known = span(white(final.slopes[0]))
     r = white(final.residual[0])
     return known, r - known @ (known.T @ r)
 

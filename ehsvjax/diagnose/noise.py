@@ -132,13 +132,13 @@ def noise_outside(
 
 
 def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
-    """Return orthonormal directions of the responses' space."""
+    """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples."""
     shape = responses.shape[1:]
     flat = responses.reshape(len(responses), -1)
     norms = np.linalg.norm(flat, axis=1)
     flat = flat[norms > 0] / norms[norms > 0, None]
     values, vectors = np.linalg.svd(flat, full_matrices=False)[1:]
-    kept = vectors[values > _NEGLIGIBLE * values[0]]
+    kept = vectors[values > _NEGLIGIBLE * values[0]][: flat.shape[1] // 2]
     return np.moveaxis(kept.reshape(-1, *shape), 0, 2)
 
 

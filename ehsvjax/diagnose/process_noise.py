@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnose.refits import Refits
-from ehsvjax.diagnose.screening import complement
+from ehsvjax.diagnose.screening import span
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.precision.residual_noise import residual_noise
 
@@ -43,7 +43,7 @@ def process_noise(bench: Workbench, final: Refits) -> ProcessNoise | None:
     if not places or len(bench.problem.observed) > 1:
         return None
     measured = samples.measured[..., 0]
-    known = complement(final.slopes[0][..., 0][:, measured])
+    known = span(final.slopes[0][..., 0][:, measured])
     residual = final.residual[0][..., 0]
     r = residual[measured]
     r = r - known @ (known.T @ r)

@@ -93,6 +93,7 @@ def diagnose(
         unseen=unseen_by(selection, suspected),
         innocent=examined.innocent,
         missing=missing,
+        process_noise=examined.chance,
         fit=fit,
         record=record,
     )

@@ -83,7 +83,7 @@ def refit(
 
     """
     lower, upper = bounds_of(bench)
-    measured = bench.problem.samples.outputs
+    readings = bench.problem.samples.outputs
     count, width = chosen.shape
     points = starts.copy()
     kept: list = [None] * count
@@ -100,7 +100,7 @@ def refit(
         if not len(at):
             break
         y, slopes = bench.linearised(trial[at], chosen[at])
-        residual = measured[None] - y
+        residual = readings[None] - y
         whitened = white(residual)
         columns = white(slopes)
         for row, i in enumerate(at):

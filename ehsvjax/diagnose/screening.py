@@ -149,8 +149,8 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
     return found
 
 
-def complement(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
-    """Return an orthonormal basis of what the unknowns can do."""
+def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
+    """Return an orthonormal basis of what the unknowns can do to first order."""
     norms = np.linalg.norm(slopes, axis=1)
     kept = slopes[norms > 0] / norms[norms > 0, None]
     if not len(kept):
@@ -173,7 +173,7 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
     from scipy.special import ndtri
 
     r = white(current.residual[0])
-    known = complement(white(current.slopes[0]))
+    known = span(white(current.slopes[0]))
     g = white(tried.changes)
     whole = np.linalg.norm(g, axis=1)
     g = g - (g @ known) @ known.T

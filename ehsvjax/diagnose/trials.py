@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ehsvjax.diagnose.missing import curve_responses, quantities
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit
-from ehsvjax.diagnose.screening import Screened, complement
+from ehsvjax.diagnose.screening import Screened, span
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
@@ -45,14 +45,14 @@ def trials_of(bench: Workbench, progress: Callable[[str], None]) -> Trials:
     return Trials(bench, seen, curve_responses(bench, bench.nominal, seen), {}, progress)
 
 
-def width(bench: Workbench) -> int:
-    """Return how many unknowns are refitted at once, at most."""
+def most_unknowns(bench: Workbench) -> int:
+    """Return how many unknowns can be refitted at once."""
     return len(bench.base_columns) + _OWN_NUMBERS
 
 
 def fits(bench: Workbench, included: Sequence[int]) -> bool:
     """Whether these effects can be refitted together."""
-    return len(bench.columns_with(included)) <= width(bench)
+    return len(bench.columns_with(included)) <= most_unknowns(bench)
 
 
 def refit_sets(
@@ -69,7 +69,7 @@ def refit_sets(
     bench = trials.bench
     known = [trials.reached.get(frozenset(s)) for s in sets]
     choices = [[start] if before is None else [start, before] for start, before in zip(starts, known, strict=True)]
-    columns = padded([bench.columns_with(s) for s in sets], width(bench))
+    columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
     found = refit(bench, _best_of(bench, choices, white), columns, white, race=race)
     for point, cost, included in zip(found.points, found.cost, sets, strict=True):
         if np.isfinite(cost):
@@ -104,7 +104,7 @@ def _best_of(
     points = np.concatenate([np.stack(choice) for choice in choices])
     r = white(bench.problem.samples.outputs - bench.simulated(points))
     if current is not None:
-        known = complement(white(current.slopes[0]))
+        known = span(white(current.slopes[0]))
         r = r - (r @ known) @ known.T
     cost = np.sum(r**2, axis=1)
     cost = np.where(np.isfinite(cost), cost, np.inf)

@@ -27,7 +27,7 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
     explained = removed / max(removed + left, 1e-300)
     if examined.lacking or (not examined.innocent and (not groups or explained < _EXPLAINED)):
         return "unexplained", (), ()
-    causes = tuple(group[0] for group in groups) + _quantised(misfit) + ((PROCESS_NOISE,) if examined.by_chance else ())
+    causes = tuple(group[0] for group in groups) + _quantised(misfit) + ((PROCESS_NOISE,) if examined.chance else ())
     if not causes:
         return "adequate", (), ()
     alternatives = tuple(Alternative(g, _settled_by(selection.bench, g)) for g in groups if len(g) > 1)

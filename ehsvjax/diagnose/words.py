@@ -77,6 +77,11 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             for name, value in numbers.items()
         )
         lines.append(f"{row.cause} at {row.signal}: {said}; without it {row.likelihood_gain:.4g} noise variances worse")
+    if diagnosis.process_noise is not None:
+        place, intensity, *_ = diagnosis.process_noise
+        unit = diagnosis.fit.model.unit(place)
+        density = f"({unit})^2 s" if unit else "s"
+        lines.append(f"process_noise: a random force at {place} of spectral density {intensity:.3g} {density}")
     m = diagnosis.missing
     if m is not None:
         unit = _spaced("of its value" if m.relative else m.unit)
@@ -86,7 +91,8 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
         lines.append(
             f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, as a "
             f"function of {m.quantity}: up to {m.estimate[peak]:.3g} +/- {m.deviation[peak]:.2g}{unit} at "
-            f"{m.at[peak]:.3g}{_spaced(m.quantity_unit)} (see .missing and .plot())"
+            f"{m.at[peak]:.3g}{_spaced(m.quantity_unit)}; it takes {100 * m.explained:.0f}% of what is left "
+            "(see .missing and .plot())"
         )
     return lines
 

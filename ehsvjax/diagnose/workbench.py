@@ -175,7 +175,10 @@ def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
 
     signal = candidate.signal
     value = record.inputs.get(signal, internal.values.get(signal, np.ones(1)))
-    context = {name: largest(series) for name, series in internal.contexts.get(signal, {}).items()}
+    context = {}
+    for name, series in internal.contexts.get(signal, {}).items():
+        context[name] = largest(series)
+        context |= {f"{name}{sign}": largest(np.maximum(side * series, 0.0)) for sign, side in (("+", 1), ("-", -1))}
     return {
         **context,
         "value": largest(value),

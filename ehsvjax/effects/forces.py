@@ -4,9 +4,9 @@ import functools
 
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import Effect, EffectParameter, Scales, amplitude, constant, shape, size
+from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, amplitude, constant, shape, size
 
-# A force has no size that could be known before it was tried: probes start from this, SI, and are enlarged.
+# A force has no size that could be known before it was tried: probes are this large, SI, and taken to be linear.
 _PROBE = 1e-3
 # Of an end stop, N/m: stiff enough for any stop, and soft enough for an explicit force at a quarter of a millisecond.
 _STOP_STIFFNESS = 3e7
@@ -84,16 +84,17 @@ def _stribeck(own, velocity):
 
 
 def _stop(side):
-    """Return the force of a stop on one side, and its tries, shares of the largest position."""
+    """Return the force of a stop on one side, and its tries, shares of how far the motion goes on that side."""
     end = "positive_end" if side > 0 else "negative_end"
+    reach = "position+" if side > 0 else "position-"
 
     def term(own, context):
         depth = jnp.maximum(side * context["position"] - own[end], 0.0)
         return side * _STOP_STIFFNESS * depth
 
     position = EffectParameter(
-        end, "m", 1e30, lambda s: 0.02 * s["position"], lambda s: 1.02 * s["position"],
-        lambda s: [t * s["position"] for t in (0.98, 0.9, 0.75)],
+        end, "m", UNLIMITED, lambda s: 0.02 * s[reach], lambda s: 1.02 * s[reach],
+        lambda s: [t * s[reach] for t in (0.98, 0.9, 0.75)],
     )  # fmt: skip
     return _load(
         "end_stop",

@@ -51,7 +51,6 @@ def _lagged(own, series, context):
     def follow(level, target):
         return target + (level - target) * decay, target + (level - target) * share
 
-    # Before the record the command was what it first is, or zero; from rest it is zero.
     return lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
 
 
