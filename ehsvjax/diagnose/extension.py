@@ -33,7 +33,8 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
     values = dict(zip(bench.column, to_values(bench.problem.coordinates, refits.points[0]), strict=True))
     known = {n: v[0] for n, v in bench.problem.known_initial.items()}
     initial = {p.name: float((values | known)[p.name]) for p in bench.fit.model.initial}
-    attached = tuple(bench.candidates[i] for i in included)
+    # In the order of the bank, in which they act one after another at a signal.
+    attached = tuple(bench.candidates[i] for i in sorted(included))
     numbers = {}
     for candidate in attached:
         scales = bench.scales[candidate.name]

@@ -10,8 +10,12 @@ _STAIRCASE = "a staircase of levels; measure the supply pressure"
 
 
 def _leaking(own, opening, context):
-    inside = jnp.clip(context["spool"], -context["dead_zone"], context["dead_zone"])
-    return opening + own["ratio"] * inside
+    """Return the opening with flow inside the dead zone; fully open it is as far open as without."""
+    spool, most = context["spool"], context["saturation"]
+    sharp = dead_zone(spool, context["dead_zone"])
+    leaking = sharp + own["ratio"] * (spool - sharp)
+    # What another effect has done to the opening stays.
+    return opening + jnp.clip(leaking, -most, most) - jnp.clip(sharp, -most, most)
 
 
 def _rounded(own, opening, context):
@@ -79,7 +83,7 @@ VALVE = (
         "opening",
         (size("ratio", "", constant(1e-3), constant(3.0)),),
         _leaking,
-        needs=("spool", "dead_zone"),
+        needs=("spool", "dead_zone", "saturation"),
         says="flow passes the lands inside the dead zone",
         settled_by="slow small ramps through null, and long dwells",
     ),
