@@ -9,7 +9,7 @@ import ehsvjax
 from ehsvjax.effects import BANK, Effect, amplitude, attach, candidates, effects_of
 from ehsvjax.effects.internal import contexts_of, internal_signals
 from tests.compilations import compilations
-from tests.hidden_plants import held_levels, servovalve_with
+from tests.hidden_plants import effect_sizes, held_levels, servovalve_with, van_der_pol_with
 
 TIME = np.arange(300) * 1e-3
 COMMAND = held_levels(np.random.default_rng(0), 6e-3, 3, 100)
@@ -33,22 +33,80 @@ def test_attached_but_absent_effects_change_nothing():
     np.testing.assert_allclose(ehsvjax.simulate(extended, RECORD)["position"], nominal, atol=1e-7)
 
 
+# What the plants call otherwise: number of the plant -> numbers of the package.
+RENAMED = {
+    ("feedback_backlash", "width"): lambda width: {"half_width": width},
+    ("torque_motor_hysteresis", "width"): lambda width: {"half_width": width},
+    ("input_dead_zone", "width"): lambda width: {"half_width": width},
+    ("spool_rate_limit", "rate"): lambda rate: {"limit": rate},
+    ("structural_flexibility", "stiffness"): lambda stiffness: {"compliance": 1.0 / stiffness},
+    ("end_stop", "position"): lambda position: {"positive_end": position},
+    ("end_stop", "stiffness"): lambda stiffness: {},
+}
+# A stop of the package has a stiffness of its own, N/m.
+STOP = {"position": 0.01, "stiffness": 3e7}
+
+
+def in_the_package(name, sizes):
+    """Return the numbers of the package's effect that has a plant's sizes."""
+    if "phase" in sizes:
+        # A load by the sine of the plant's phase, against the package's force; the oscillator's by its cosine.
+        size, phase = sizes.get("force", sizes.get("depth")), sizes["phase"]
+        turned = (-np.sin(phase), -np.cos(phase)) if name == "harmonic_load" else (np.cos(phase), -np.sin(phase))
+        return {"cosine": size * turned[0], "sine": size * turned[1], "frequency": sizes["frequency"]}
+    found = {}
+    for number, value in sizes.items():
+        found |= RENAMED.get((name, number), lambda value, number=number: {number: value})(value)
+    return found
+
+
+def everything_attached(model, duration):
+    """Return the model with the whole bank, and the values with which all of it is absent."""
+    bounds, absent = {}, {}
+    for candidate in candidates(model, BANK, contexts_of(model), model.outputs):
+        for number in candidate.effect.parameters:
+            # A shape means nothing where the amplitude is zero.
+            name = candidate.parameter(number.name)
+            absent[name] = 1.0 if number.absent is None else number.absent
+            bounds[name] = (absent[name], absent[name] + max(1.0, absent[name]))
+    return attach(model, bounds, duration=duration, bank=BANK), absent
+
+
 @pytest.mark.parametrize(
-    ("name", "value", "effect"),
+    ("make", "plant", "period", "command", "exact"),
     [
-        ("transport_delay.delay", 3e-3, {"transport_delay": {"delay": 3e-3}}),
-        ("null_bias.bias", 5e-5, {"null_bias": {"bias": 5e-5}}),
-        ("supply_droop.resistance", 1e9, {"supply_droop": {"resistance": 1e9}}),
-        ("feedback_backlash.half_width", 4e-4, {"feedback_backlash": {"width": 4e-4}}),
-        ("coulomb_friction.force", 3e3, {"coulomb_friction": {"force": 3e3}}),
+        (ehsvjax.servovalve, servovalve_with, 1e-3, COMMAND, 4e-6),
+        (ehsvjax.van_der_pol, van_der_pol_with, 0.02, held_levels(np.random.default_rng(2), 1.0, 10, 60), 2e-4),
     ],
 )
-def test_an_effect_is_what_an_independent_plant_has(name, value, effect):
-    model = attach(ehsvjax.servovalve(), {name: (0.0, 2.0 * value)}, duration=0.3, bank=BANK)
-    found = ehsvjax.simulate(model, RECORD, {name: value})["position"]
-    plant = servovalve_with([effect], COMMAND[None], 1e-3)["position"][0]
-    plain = servovalve_with([{}], COMMAND[None], 1e-3)["position"][0]
-    assert np.abs(found - plant).max() < 0.02 * np.abs(plain - plant).max() + 2e-6
+def test_every_effect_is_what_an_independent_plant_has(make, plant, period, command, exact):
+    model, record = make(), ehsvjax.Record(np.arange(len(command)) * period, {"command": command})
+    ranges = effect_sizes("servovalve" if make is ehsvjax.servovalve else "van_der_pol")
+    hidden = {
+        name: STOP if name == "end_stop" else {k: low + 0.7 * (high - low) for k, (low, high) in numbers.items()}
+        for name, numbers in ranges.items()
+        if not name.startswith("unknown") and name not in ("sensor_quantisation", "process_noise")
+    }
+    # Limits that this short record reaches, and sizes that it shows.
+    limits = {"sensor_saturation": 0.01 if make is ehsvjax.servovalve else 1.6, "input_saturation": 0.5}
+    hidden |= {name: {"limit": limit} for name, limit in limits.items() if name in hidden}
+    large = {"stribeck_friction": {"force": 1e4, "velocity": 0.05}, "flow_gain_rounding": {"width": 3e-4}}
+    hidden |= {name: sizes for name, sizes in (large | {"spool_rate_limit": {"rate": 0.3}}).items() if name in hidden}
+    plain, *shown = plant([{}, *({n: s} for n, s in hidden.items())], np.tile(command, (len(hidden) + 1, 1)), period)[
+        "position"
+    ]
+    extended, absent = everything_attached(model, len(command) * period)
+    off = {}
+    for (name, sizes), truth in zip(hidden.items(), shown, strict=True):
+        values = dict(absent)
+        for number, value in in_the_package(name, sizes).items():
+            (found,) = [n for n in (f"{name}{at}.{number}" for at in ("", "@position", "@gamma")) if n in values]
+            values[found] = value
+        simulated = ehsvjax.simulate(extended, record, values)["position"]
+        effect, error = np.abs(truth - plain).max(), np.abs(simulated - truth).max()
+        if effect < 3 * exact or error > 0.02 * effect + exact:
+            off[name] = (float(effect), float(error))
+    assert off == {}
 
 
 def test_candidates_are_found_from_the_model():
@@ -64,18 +122,11 @@ def test_candidates_are_found_from_the_model():
 @pytest.mark.parametrize("make", [ehsvjax.servovalve, ehsvjax.van_der_pol])
 def test_every_effect_of_the_bank_absent_changes_nothing(make):
     model = make()
-    period = 1e-3 if model.name == "servovalve" else 0.02
-    levels = held_levels(np.random.default_rng(1), 6e-3 if model.name == "servovalve" else 1.0, 3, 100)
+    period = 1e-3 if make is ehsvjax.servovalve else 0.02
+    levels = held_levels(np.random.default_rng(1), 6e-3 if make is ehsvjax.servovalve else 1.0, 3, 100)
     record = ehsvjax.Record(np.arange(300) * period, {"command": levels})
-    bounds = {}
-    for candidate in candidates(model, BANK, contexts_of(model), model.outputs):
-        for number in candidate.effect.parameters:
-            # The number that makes the effect vanish is where it does; a shape means nothing then.
-            name = candidate.parameter(number.name)
-            at = 1.0 if number.absent is None else number.absent
-            bounds[name] = (at, at + max(1.0, at))
-    extended = attach(model, bounds, duration=300 * period, bank=BANK)
-    nominal, found = ehsvjax.simulate(model, record), ehsvjax.simulate(extended, record)
+    extended, absent = everything_attached(model, 300 * period)
+    nominal, found = ehsvjax.simulate(model, record), ehsvjax.simulate(extended, record, absent)
     for name in model.outputs:
         np.testing.assert_allclose(found[name], nominal[name], rtol=1e-5, atol=2e-6 * np.abs(nominal[name]).max())
 
