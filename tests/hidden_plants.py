@@ -133,10 +133,11 @@ def servovalve_with(
     sample_period: float,
     *,
     noise: np.ndarray | None = None,
+    initial_position: float = 0.0,
     fine_step: float = SERVOVALVE_STEP,
     **valve: float,
 ) -> dict[str, np.ndarray]:
-    """Simulate servovalves from rest over a command [batch, time], m of spool stroke, held between samples.
+    """Simulate servovalves from rest at a position over a command [batch, time], m of stroke, held between samples.
 
     Takes one mapping of effects for each record, the parameters of `Valve`, and noise [batch, time], m, to be added
     to the position before it is quantised. Returns, [batch, time], the measured position m, the spool's displacement
@@ -156,10 +157,11 @@ def servovalve_with(
     hysteresis, backlash = sizes.get("torque_motor_hysteresis", 0.0), sizes.get("feedback_backlash", 0.0)
     lag = sizes.get("sensor_lag")
 
-    load = Load(np.zeros(batch), np.zeros(batch), np.zeros(batch))
+    load = Load(np.full(batch, initial_position), np.zeros(batch), np.zeros(batch))
     spool_and_input = np.zeros((4, batch))  # displacement, its rate, error at the start and at the end of the step
     spool, rate, error, next_error = spool_and_input
-    fed_back, driven, seen, sensed = (np.zeros(batch) for _ in range(4))
+    fed_back, driven = np.zeros(batch), np.zeros(batch)
+    seen, sensed = load.position, load.position
     position, displacement, pressure = np.empty((3, samples, batch))
     for sample in range(samples):
         position[sample], displacement[sample], pressure[sample] = sensed, spool, load.pressure

@@ -93,9 +93,10 @@ def plant(model: str, effects: Sequence[Mapping], commands, period, noise=None) 
 
 
 class Nominal(NamedTuple):
-    """A plant without any effect: its position [time], and orthonormal directions by its parameters [time, direction].
+    """A plant without any effect: its position [time], and orthonormal directions [time, direction].
 
-    What lies outside those directions no refit of the parameters could do, to first order.
+    The directions are those of its parameters and initial conditions: what lies outside them no refit could do, to
+    first order.
     """
 
     position: np.ndarray
@@ -123,8 +124,9 @@ def nominal(model: str, seed: int, samples: int) -> Nominal:
     together = [name for name in truth if name not in alone]
     sides = {name: truth[name] * (1.0 + 1e-5 * np.eye(len(together) + 1)[i + 1]) for i, name in enumerate(together)}
     plain, *moved = positions(sides)
-    moved += [simulate([{}], command[None, :samples], period, **{n: truth[n] * (1.0 + 1e-5)})["position"][0]
-              for n in alone]  # fmt: skip
+    others = [{name: truth[name] * (1.0 + 1e-5)} for name in alone]
+    others += [{"initial_position": 1e-6}] if model == "servovalve" else [{"initial": x} for x in 1e-5 * np.eye(2)]
+    moved += [simulate([{}], command[None, :samples], period, **other)["position"][0] for other in others]
     return Nominal(plain, np.linalg.qr((np.array(moved) - plain).T)[0])
 
 
