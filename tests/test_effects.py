@@ -41,10 +41,10 @@ RENAMED = {
     ("spool_rate_limit", "rate"): lambda rate: {"limit": rate},
     ("structural_flexibility", "stiffness"): lambda stiffness: {"compliance": 1.0 / stiffness},
     ("end_stop", "position"): lambda position: {"positive_end": position},
-    ("end_stop", "stiffness"): lambda stiffness: {},
+    ("end_stop", "stiffness"): lambda stiffness: {"positive_stiffness": stiffness},
 }
-# A stop of the package has a stiffness of its own, N/m.
-STOP = {"position": 0.01, "stiffness": 3e7}
+# That this short record reaches.
+STOP = {"position": 0.01, "stiffness": 8e7}
 
 
 def in_the_package(name, sizes):
@@ -195,5 +195,6 @@ def test_a_duration_that_is_none_is_refused(duration):
 
 
 def test_two_forms_of_one_name_are_attached_together():
-    ends = {"end_stop.positive_end": (0.0, 0.1), "end_stop.negative_end": (0.0, 0.1)}
+    ends = {f"end_stop.{side}_end": (0.0, 0.1) for side in ("positive", "negative")}
+    ends |= {f"end_stop.{side}_stiffness": (1e6, 3e8) for side in ("positive", "negative")}
     assert set(ends) <= set(attach(ehsvjax.servovalve(), ends, duration=1.0, bank=BANK).free)

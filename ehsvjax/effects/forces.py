@@ -8,8 +8,8 @@ from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, a
 
 # A force has no size that could be known before it was tried: probes are this large, SI, and taken to be linear.
 _PROBE = 1e-3
-# Of an end stop, N/m: stiff enough for any stop, and soft enough for an explicit force at a quarter of a millisecond.
-_STOP_STIFFNESS = 3e7
+# Of an end stop, N/m: at most what an explicit force bears at a quarter of a millisecond.
+_STOP_STIFFNESS, _SOFTEST, _STIFFEST = 3e7, 1e6, 3e8
 
 
 def _per(quantity: str, power: int):
@@ -85,22 +85,25 @@ def _stribeck(own, velocity):
 
 def _stop(side):
     """Return the force of a stop on one side, and its tries, shares of how far the motion goes on that side."""
-    end = "positive_end" if side > 0 else "negative_end"
-    reach = "position+" if side > 0 else "position-"
+    sign = "positive" if side > 0 else "negative"
+    end, stiffness, reach = f"{sign}_end", f"{sign}_stiffness", "position+" if side > 0 else "position-"
 
     def term(own, context):
         depth = jnp.maximum(side * context["position"] - own[end], 0.0)
-        return side * _STOP_STIFFNESS * depth
+        return side * own[stiffness] * depth
 
     position = EffectParameter(
         end, "m", UNLIMITED, lambda s: 0.02 * s[reach], lambda s: 1.02 * s[reach],
         lambda s: [t * s[reach] for t in (0.98, 0.9, 0.75)],
     )  # fmt: skip
+    hardness = shape(
+        stiffness, "N/m", lambda s: [_STOP_STIFFNESS], lambda s: _SOFTEST, lambda s: _STIFFEST
+    )  # fmt: skip
     return _load(
         "end_stop",
-        (position,),
+        (position, hardness),
         term,
-        says=f"the motion ends at a stop on the {'positive' if side > 0 else 'negative'} side",
+        says=f"the motion ends at a stop on the {sign} side",
         settled_by="move to the end by hand, with a gauge: a stop stops the load, a sensor's end does not",
     )
 
