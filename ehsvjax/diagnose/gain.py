@@ -108,8 +108,9 @@ def _gain(before, after, readings, noise_variance, rng) -> OutputGain:
     if removable > 4.0 * noise_variance * np.sqrt(2.0 / len(before)):
         share = float((mean[0] - mean[1]) / removable)
         drawn = _redrawn(squares, rng)
-        # What is removable is taken as it is: a misfit that is short would be in few of the drawn blocks.
-        shares = (drawn[:, 0] - drawn[:, 1]) / removable
+        # What is removable is taken as it is, for a short misfit would be in few of the drawn blocks: what is left of
+        # it is what is uncertain.
+        shares = 1.0 - (drawn[:, 1] - noise_variance) / removable
         low, high = (float(q) for q in np.quantile(shares, [0.025, 0.975]))
     rmse, fits = np.sqrt(mean), 100.0 * (1.0 - np.sqrt(mean / about_mean))
     return OutputGain(

@@ -9,7 +9,7 @@ from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, a
 # A force has no size that could be known before it was tried: probes are this large, SI, and taken to be linear.
 _PROBE = 1e-3
 # Of an end stop, N/m: at most what an explicit force bears at a quarter of a millisecond.
-_STOP_STIFFNESS, _SOFTEST, _STIFFEST = 3e7, 1e6, 3e8
+_STOP_STIFFNESS, _SOFTEST, _STIFFEST = (1e7, 3e7, 1e8), 1e6, 3e8
 
 
 def _per(quantity: str, power: int):
@@ -97,7 +97,7 @@ def _stop(side):
         lambda s: [t * s[reach] for t in (0.98, 0.9, 0.75)],
     )  # fmt: skip
     hardness = shape(
-        stiffness, "N/m", lambda s: [_STOP_STIFFNESS], lambda s: _SOFTEST, lambda s: _STIFFEST
+        stiffness, "N/m", lambda s: _STOP_STIFFNESS, lambda s: _SOFTEST, lambda s: _STIFFEST
     )  # fmt: skip
     return _load(
         "end_stop",
