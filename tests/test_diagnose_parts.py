@@ -123,16 +123,17 @@ def test_beyond_what_was_drawn_bonferroni_bounds():
 
 
 def test_the_least_size_is_linear_for_a_proportional_effect():
-    assert _least_size([(2.0, 10.0)], 5.0) == pytest.approx(1.0)
-    assert _least_size([], 5.0) == np.inf
+    assert _least_size([(2.0, 10.0)], True, 5.0) == pytest.approx(1.0)
+    assert _least_size([(2.0, 10.0), (2.0, 40.0), (2.0, 0.0)], True, 5.0) == pytest.approx(0.25)
+    assert _least_size([], True, 5.0) == np.inf
 
 
 def test_nothing_is_claimed_below_the_least_size_that_was_tried():
     # An effect that grows with the square of its size.
     shown = [(s, 100.0 * s**2) for s in (0.5, 1.0, 2.0)]
-    assert _least_size(shown, 4.0) == 0.5
-    assert _least_size(shown, 150.0) == pytest.approx(1.5**0.5)
-    assert _least_size(shown, 1e4) == np.inf
+    assert _least_size(shown, False, 4.0) == 0.5
+    assert _least_size(shown, False, 150.0) == pytest.approx(1.5**0.5)
+    assert _least_size(shown, False, 1e4) == np.inf
 
 
 def test_an_output_without_readings_has_no_gain():

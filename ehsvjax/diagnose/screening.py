@@ -58,7 +58,8 @@ class Screened(NamedTuple):
         start: `[parameter]` the point from which to refit it.
         response: `[sample]` what the refit of the unknowns cannot do instead, whitened, of unit length.
         shown: sizes of the effect, of `amount`'s unit, that were tried, and the deviations of the noise by which each
-            moves the record; a single one if the response is proportional to the size; none for a limit.
+            moves the record; none for a limit.
+        proportional: whether half the size would show half as much.
         amount: of the step, SI, in the first of the effect's numbers.
 
     """
@@ -70,6 +71,7 @@ class Screened(NamedTuple):
     start: Float[np.ndarray, " parameter"]
     response: Float[np.ndarray, " sample"]
     shown: tuple[tuple[float, float], ...]
+    proportional: bool
     amount: float
 
 
@@ -207,6 +209,7 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
             start=start,
             response=q @ u / max(np.linalg.norm(u), 1e-300) if several else q[:, 0],
             shown=shown,
+            proportional=trial.proportional,
             amount=amount,
         )  # fmt: skip
         before = best.get(trial.candidate)

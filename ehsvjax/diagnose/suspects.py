@@ -85,17 +85,17 @@ def _detectable(selection: Selection) -> dict[int, float]:
     for stage in selection.stages:
         for s in stage.screening.ranked:
             needed = np.sqrt(required_gain(selection.bench, stage.screening, s.candidate)) + _POWER_QUANTILE
-            found[s.candidate] = _least_size(s.shown, float(needed))
+            found[s.candidate] = _least_size(s.shown, s.proportional, float(needed))
     for i in selection.stages[-1].screening.unseen:
         found.pop(i, None)
     return {i: size for i, size in found.items() if np.isfinite(size)}
 
 
-def _least_size(shown: Sequence[tuple[float, float]], needed: float) -> float:
+def _least_size(shown: Sequence[tuple[float, float]], proportional: bool, needed: float) -> float:
     """Return the size that moves the record by so many deviations of the noise; +inf if none that was tried does."""
-    if len(shown) == 1:
-        ((size, deviations),) = shown
-        return size * needed / deviations if deviations > 0 else float("inf")
+    if proportional:
+        # Of several shapes the one that shows best.
+        return min((size * needed / deviations for size, deviations in shown if deviations > 0), default=float("inf"))
     # Not proportional: between sizes that were tried, on logarithmic scales; nothing is claimed below the least.
     before = None
     for size, deviations in shown:
