@@ -81,7 +81,8 @@ VALVE = (
     Effect(
         "null_leakage",
         "opening",
-        (size("ratio", "", constant(1e-3), constant(3.0)),),
+        # Small leaks a refit of the dead zone does as well: what is left grows faster than the ratio.
+        (EffectParameter("ratio", "", 0.0, constant(0.0), constant(3.0), lambda s: (0.03, 0.1, 0.3)),),
         _leaking,
         needs=("spool", "dead_zone", "saturation"),
         says="flow passes the lands inside the dead zone",
