@@ -11,18 +11,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from tests.hidden_plants import effect_sizes, held_levels, servovalve_with, van_der_pol_with
+from tests.hidden_plants import Valve, effect_sizes, held_levels, servovalve_with, van_der_pol_with
 
 EXCITATIONS = 3
+# What is identified, as the plants have it.
+_IDENTIFIED = ("dead_zone", "saturation", "flow_gain", "feedback_gain", "damping_ratio", "natural_frequency")
 TRUTH = {
-    "servovalve": {
-        "dead_zone": 1e-4,
-        "saturation": 3e-3,
-        "flow_gain": 1.45e-4,
-        "feedback_gain": 0.09,
-        "damping_ratio": 0.72,
-        "natural_frequency": 300.0,
-    },
+    "servovalve": {name: getattr(Valve(), name) for name in _IDENTIFIED},
     "van_der_pol": {"alpha": 0.96, "gamma": 1.23},
 }
 # Sizes of these are never negative.
