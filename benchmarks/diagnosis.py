@@ -1,6 +1,6 @@
 """Does a diagnosis find what was hidden? Many records of independent plants, each with effects drawn at random.
 
-    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all] [--seed 0]
+    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all] [--model all] [--seed 0]
 
 The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
 kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an
@@ -70,7 +70,7 @@ def trials_of(options) -> list[Trial]:
             found.append(Trial("two", Hidden(model, "white", variances[i % 2], pair, seed())))
         for i in range(options.unknown // 2):
             found.append(Trial("unknown", Hidden(model, "white", variances[0], (unknown[i % len(unknown)],), seed())))
-    return [t for t in found if options.kind in ("all", t.kind)]
+    return [t for t in found if options.kind in ("all", t.kind) and options.model in ("all", t.hidden.model)]
 
 
 def tried(trials: list[Trial]) -> list[dict[str, Any]]:
@@ -249,6 +249,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=60, help="records with two effects")
     parser.add_argument("--unknown", type=int, default=60, help="records with an effect that the bank lacks")
     parser.add_argument("--kind", choices=["all", "one", "none", "two", "unknown"], default="all")
+    parser.add_argument("--model", choices=["all", *VARIANCES], default="all")
     parser.add_argument("--seed", type=int, default=0, help="of all trials")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
