@@ -1,48 +1,137 @@
-"""The frequencies at which a residual is strongest: where harmonic effects are looked for."""
+"""The frequencies at which harmonic effects are tried: those at which they would explain most of a residual.
 
+What an effect does at some frequency is the sum of what it does in short parts of the record, which need to be
+simulated once only. Frequencies too high for the parts are looked for in the residual itself.
+"""
+
+from collections.abc import Sequence
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.refits import Refits
+from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.parts import Parts, parts_at
+from ehsvjax.diagnose.refits import Refits, span
 from ehsvjax.diagnose.workbench import Workbench
-from ehsvjax.effects.effect import Scales
+from ehsvjax.effects.effect import Candidate, Scales
 
-# Frequencies that are tried, of the residual and of its product with a motion.
-_PEAKS = 3
+# Frequencies of each effect that are tried.
+_TRIED = 3
+# Two frequencies differ if they drift apart by this many periods along the record; the search looks closer.
+_APART, _CLOSE = 2.0, 0.2
+# Periods of the highest frequency whose share over a part is known well enough.
+_PERIODS_PER_PART = 0.35
 
 
-def with_frequencies(bench: Workbench, current: Refits) -> Workbench:
-    """Return the bench with the frequencies at which a residual, and its product with a motion, are strongest."""
-    measured = bench.problem.samples.measured[0, :, 0]
+def parts_of(bench: Workbench) -> dict[str, Parts]:
+    """Return the responses to parts of a disturbance at every signal that a harmonic effect could disturb."""
+    places = dict.fromkeys(c.signal for c in bench.candidates if _by_parts(bench, c))
+    return {place: parts_at(bench, bench.nominal, place) for place in places}
+
+
+def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts: dict[str, Parts]) -> Workbench:
+    """Return the bench with the frequencies at which each harmonic effect is to be tried."""
     period = float(bench.problem.samples.sample_period[0])
+    duration = len(current.residual[0, 0]) * period
+    known = span(white(current.slopes[0]))
+    r = white(current.residual[0])
+    r = r - known @ (known.T @ r)
+    scales: dict[str, Scales] = {}
+    for candidate in bench.candidates:
+        if not candidate.effect.harmonic:
+            continue
+        lowest, highest = 3.0 / duration, 2.0 / period
+        peaks: list[tuple[float, float]] = []
+        if _by_parts(bench, candidate):
+            there = parts[candidate.signal]
+            edge = min(highest, 2.0 * np.pi * _PERIODS_PER_PART / there.length)
+            frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration)
+            peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, white, known, r, there))
+            lowest = edge
+        peaks += _peaks(*_periodogram(bench, current, lowest, highest))
+        found = _strongest(peaks, duration)
+        scales[candidate.name] = {**bench.scales[candidate.name], "frequencies": found or (2.0 * np.pi / duration,)}
+    return replace(bench, scales={**bench.scales, **scales})
+
+
+def _by_parts(bench: Workbench, candidate: Candidate) -> bool:
+    """Whether what a harmonic effect does is the sum of what it does in parts of the record."""
+    return candidate.effect.harmonic and candidate.signal in bench.places and not candidate.effect.memory
+
+
+def _explained(
+    bench: Workbench, candidate: Candidate, frequencies, white: Whitening, known, r, parts: Parts
+) -> Float[np.ndarray, " frequency"]:
+    """Return the noise variances of the residual that an effect would take at each frequency, to first order."""
+    changes = white(parts.responses)
+    changes = changes - (changes @ known) @ known.T
+    shares = _shares(bench, candidate, frequencies, parts)
+    along = shares @ (changes @ r)
+    information = np.einsum("fap,pq,fbq->fab", shares, changes @ changes.T, shares, optimize=True)
+    # An amplitude that does not show takes nothing.
+    return np.einsum("fa,fab,fb->f", along, np.linalg.pinv(information, rcond=1e-9, hermitian=True), along)
+
+
+def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
+    """Return what each of an effect's amplitudes adds to its signal in each part, `[frequency, amplitude, part]`."""
+    numbers = candidate.effect.parameters
+    scales = {**bench.scales[candidate.name], "frequencies": (1.0,)}
+    amplitudes = [n for n in numbers if n.absent is not None]
+    absent = {n.name: n.absent if n.absent is not None else n.tries(scales)[0] for n in numbers}
+    internal = bench.internal
+    period = float(bench.problem.samples.sample_period[0])
+    time = np.arange(len(parts.of_sample)) * period
+    context = {**internal.contexts[candidate.signal], "time": time}
+    always = {"step_size": period, "duration": len(time) * period}
+
+    def added(own, value, along):
+        return candidate.effect.apply(own, value, along | always) - value
+
+    with jax.enable_x64(True):
+        every_time = jax.vmap(added, in_axes=(None, 0, 0))
+        every = jax.vmap(
+            every_time, in_axes=({n.name: 0 if n.name == "frequency" else None for n in numbers}, None, None)
+        )
+        rows = [
+            every(
+                {**absent, n.name: n.tries(scales)[0], "frequency": jnp.asarray(frequencies)},
+                jnp.asarray(internal.values[candidate.signal]),
+                {name: jnp.asarray(series) for name, series in context.items()},
+            )
+            for n in amplitudes
+        ]
+        return np.stack([parts.means(np.asarray(row)) for row in rows], axis=1)
+
+
+def _periodogram(bench: Workbench, current: Refits, lowest: float, highest: float):
+    """Return frequencies between two, rad/s, and how strong the first output's residual is there."""
+    measured = bench.problem.samples.measured[0, :, 0]
     residual = np.where(measured, current.residual[0, 0, :, 0], 0.0)
-    motion = bench.problem.samples.outputs[0, :, 0] * measured
-    plain = _peaks(residual, period, _PEAKS)
-    modulated = plain + _peaks(residual * motion, period, _PEAKS) + _peaks(
-        residual * np.gradient(motion), period, _PEAKS
-    )  # fmt: skip
-    scales: dict[str, Scales] = {
-        name: {**own, "frequencies": plain, "modulations": modulated} for name, own in bench.scales.items()
-    }
-    return replace(bench, scales=scales)
+    size = 8 * len(residual)
+    power = np.abs(np.fft.rfft((residual - residual.mean()) * np.hanning(len(residual)), size)) ** 2
+    frequency = 2.0 * np.pi * np.fft.rfftfreq(size, float(bench.problem.samples.sample_period[0]))
+    inside = (frequency > lowest) & (frequency < highest)
+    # Of a sine in white noise this is the score of its two amplitudes.
+    deviation = np.sqrt(max(float(np.var(residual[measured])), 1e-300))
+    return frequency[inside], power[inside] / (0.1875 * len(residual) * deviation**2)
 
 
-def _peaks(series: Float[np.ndarray, " time"], period: float, count: int) -> tuple[float, ...]:
-    """Return the frequencies of the largest peaks of a series' spectrum, rad/s, by an oversampled periodogram."""
-    length = len(series)
-    size = 8 * length
-    power = np.abs(np.fft.rfft((series - series.mean()) * np.hanning(length), size)) ** 2
-    frequency = 2.0 * np.pi * np.fft.rfftfreq(size, period)
-    inside = (frequency > 3.0 / (length * period)) & (frequency < 2.0 / period)
-    peak = np.zeros(len(power), bool)
-    peak[1:-1] = (power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:]) & inside[1:-1]
+def _peaks(frequencies, strength) -> list[tuple[float, float]]:
+    """Return the maxima of a strength, each with its frequency."""
+    padded = np.concatenate([[-np.inf], strength, [-np.inf]])
+    peak = (strength > padded[:-2]) & (strength >= padded[2:])
+    return list(zip(strength[peak].tolist(), frequencies[peak].tolist(), strict=True))
+
+
+def _strongest(peaks: Sequence[tuple[float, float]], duration: float) -> tuple[float, ...]:
+    """Return the frequencies of the strongest peaks that are apart: side lobes of a stronger one are no peaks."""
     found: list[float] = []
-    for j in np.flatnonzero(peak)[np.argsort(-power[peak])]:
-        # Side lobes of a stronger peak are no peaks.
-        if all(abs(frequency[j] - f) > 12.0 / (length * period) for f in found):
-            found.append(float(frequency[j]))
-        if len(found) == count:
+    for _, frequency in sorted(peaks, reverse=True):
+        if all(abs(frequency - other) > 2.0 * np.pi * _APART / duration for other in found):
+            found.append(frequency)
+        if len(found) == _TRIED:
             break
-    return tuple(found) or (2.0 * np.pi / (length * period),)
+    return tuple(found)

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits, bounds_of
-from ehsvjax.diagnose.screening import span
+from ehsvjax.diagnose.refits import Refits, bounds_of, span
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.models.model import Model

@@ -9,15 +9,12 @@ record, whose responses H are simulated, and an autoregression for the sensor.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from ehsvjax.diagnose.refits import Refits
-from ehsvjax.diagnose.screening import span
+from ehsvjax.diagnose.parts import parts_at
+from ehsvjax.diagnose.refits import Refits, span
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.precision.residual_noise import residual_noise
 
-_PARTS = 100
-_PROBE = 1e-3
 CONVINCING = 20.0
 """Twice the log-likelihood by which a force must explain a residual better than the noise of a sensor."""
 
@@ -47,25 +44,12 @@ def process_noise(bench: Workbench, final: Refits) -> ProcessNoise | None:
     residual = final.residual[0][..., 0]
     r = residual[measured]
     r = r - known @ (known.T @ r)
-    responses, length = _responses(bench, final.points[0], places[0])
-    h = responses[:, measured] / _PROBE
+    parts = parts_at(bench, final.points[0], places[0])
+    h = parts.responses[..., 0][:, measured]
     h = h - (h @ known) @ known.T
     intensity, force = _likelihood_of_force(h, r)
     sensor = _likelihood_of_sensor(np.where(measured, residual, 0.0), measured, len(r))
-    return ProcessNoise(places[0], intensity * length, 2.0 * force, 2.0 * sensor)
-
-
-def _responses(bench: Workbench, point, place) -> tuple[Float[np.ndarray, "part record time"], float]:
-    """Return what a small force over each part of the record does to the output, and the length of a part, s."""
-    samples = bench.problem.samples
-    shape = samples.outputs.shape
-    parts = min(_PARTS, shape[1] // 10)
-    part = np.minimum(np.arange(shape[1]) * parts // shape[1], parts - 1)
-    added = np.zeros((parts + 1, *shape[:2], len(bench.places)))
-    for k in range(parts):
-        added[k + 1, :, part == k, bench.places.index(place)] = _PROBE
-    outputs = bench.simulated(np.repeat(point[None], parts + 1, axis=0), added)[..., 0]
-    return outputs[1:] - outputs[0], shape[1] / parts * float(samples.sample_period[0])
+    return ProcessNoise(places[0], intensity * parts.length, 2.0 * force, 2.0 * sensor)
 
 
 def _likelihood_of_force(h, r) -> tuple[float, float]:

@@ -41,6 +41,16 @@ class Refits(NamedTuple):
         return Refits(*(field[i : i + 1] for field in self))
 
 
+def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
+    """Return an orthonormal basis of what the unknowns can do to first order."""
+    norms = np.linalg.norm(slopes, axis=1)
+    kept = slopes[norms > 0] / norms[norms > 0, None]
+    if not len(kept):
+        return np.zeros((slopes.shape[1], 0))
+    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
+    return vectors[:, values > 1e-9 * values[0]]
+
+
 def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
     """Return lists of columns side by side, filled up with -1."""
     return np.array([list(c) + [-1] * (width - len(c)) for c in columns])

@@ -60,7 +60,8 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     """Return what could be in the place of one effect, the best first: all within `INSEPARABLE` of the best."""
     bench = trials.bench
     current = refit_sets(trials, [without(bench, final.points[0], own)], [rest], white)
-    screening = screen(bench, current, responses_at(bench, current, rest), white, 1)
+    tried = responses_at(bench, current, rest, white, trials.parts)
+    screening = screen(bench, current, tried, white, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
     refitted = refit_screened(trials, close, rest, white, current)
     rivals = [Rival(own, float(final.cost[0]) + PER_NUMBER * bench.numbers_of(own), final)]

@@ -9,7 +9,7 @@ the correlated normal numbers), with the frequencies that were searched.
 
 import functools
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,8 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.frequencies import with_frequencies
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits, bounds_of
+from ehsvjax.diagnose.parts import Parts
+from ehsvjax.diagnose.refits import Refits, bounds_of, span
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import UNLIMITED, Candidate
@@ -97,16 +98,20 @@ class Responses(NamedTuple):
     changes: Float[np.ndarray, "response record time signal"]
 
 
-def responses_at(bench: Workbench, current: Refits, excluded: Collection[int]) -> Responses:
+def responses_at(
+    bench: Workbench, current: Refits, excluded: Collection[int], white: Whitening, parts: Mapping[str, Parts]
+) -> Responses:
     """Simulate the trials of every candidate but the excluded ones from the point of a refit.
 
     Args:
         bench: the trials' workbench.
         current: one refit.
         excluded: positions of candidates that it includes already.
+        white: of the noise in which frequencies are looked for.
+        parts: the responses to parts of a disturbance, by signal, for the same.
 
     """
-    bench = with_frequencies(bench, current)
+    bench = with_frequencies(bench, current, white, parts)
     point = current.points[0]
     here = bench.problem.samples.outputs - current.residual[0]
     trials = [
@@ -149,16 +154,6 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
                 )
             )
     return found
-
-
-def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
-    """Return an orthonormal basis of what the unknowns can do to first order."""
-    norms = np.linalg.norm(slopes, axis=1)
-    kept = slopes[norms > 0] / norms[norms > 0, None]
-    if not len(kept):
-        return np.zeros((slopes.shape[1], 0))
-    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
-    return vectors[:, values > 1e-9 * values[0]]
 
 
 def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening, harmonics: int) -> Screening:

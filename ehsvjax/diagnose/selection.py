@@ -113,12 +113,14 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
 def _look(trials: Trials, included: tuple[int, ...], current: Refits) -> Stage:
     """Look at what is left after a refit: its noise, and what could explain the rest."""
     bench = trials.bench
-    tried = responses_at(bench, current, included)
     measured = bench.problem.samples.measured
+    plain = plain_noise(bench.problem.noise_variance, measured)
+    tried = responses_at(bench, current, included, plain, trials.parts)
     spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
     white = noise_outside(current.residual[0], measured, spanned)
     if white.coloured or len(white.noises) > 1:
         current = refit_sets(trials, [current.points[0]], [included], white)
+        tried = responses_at(bench, current, included, white, trials.parts)
     else:
         # The variance of one output's white noise does not move the best fit.
         current = current._replace(cost=np.array([_cost_under(current, white)]))

@@ -7,10 +7,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnose.frequencies import parts_of
 from ehsvjax.diagnose.missing import curve_responses, quantities
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit
-from ehsvjax.diagnose.screening import Screened, span
+from ehsvjax.diagnose.parts import Parts
+from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit, span
+from ehsvjax.diagnose.screening import Screened
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
@@ -27,6 +29,7 @@ class Trials(NamedTuple):
         bench: the workbench.
         seen: what runs along the nominal model and varies, by name.
         curves: what terms of free form at all places would do to the outputs of the nominal model.
+        parts: what short parts of a disturbance would do, by signal, where harmonic effects may act.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
 
@@ -35,14 +38,15 @@ class Trials(NamedTuple):
     bench: Workbench
     seen: dict[str, Float[np.ndarray, " time"]]
     curves: Float[np.ndarray, "response record time signal"]
+    parts: dict[str, Parts]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Callable[[str], None]
 
 
 def trials_of(bench: Workbench, progress: Callable[[str], None]) -> Trials:
-    """Simulate what terms of free form would do; nothing has been refitted yet."""
+    """Simulate what terms of free form and parts of harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    return Trials(bench, seen, curve_responses(bench, bench.nominal, seen), {}, progress)
+    return Trials(bench, seen, curve_responses(bench, bench.nominal, seen), parts_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:

@@ -184,9 +184,8 @@ def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
         "value": largest(value),
         "duration": len(record) * record.sample_period,
         "sample_period": record.sample_period,
-        # Where the search begins; it goes where the residual is strongest.
+        # Where the search begins; it goes where a residual leads it.
         "frequencies": (2.0 * np.pi / record.sample_period / len(record),),
-        "modulations": (2.0 * np.pi / record.sample_period / len(record),),
     }
 
 

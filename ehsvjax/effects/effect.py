@@ -9,8 +9,7 @@ from ehsvjax.models.model import Model
 Scales = Mapping[str, Any]
 """How large things are in a record: `value`, the largest size of the signal itself, and of each quantity of its
 context by name (0 where nothing is known), with `+` or `-` behind the name how far it goes on that side; `duration` and
-`sample_period` in s, `frequencies` in rad/s at which the residual is strongest, and `modulations`, at which its product
-with the motion is."""
+`sample_period` in s, and `frequencies` in rad/s at which a harmonic effect would explain most."""
 
 ALWAYS = ("time", "step_size", "duration")
 """Quantities that every effect's context has."""

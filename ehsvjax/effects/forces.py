@@ -16,14 +16,13 @@ def _per(quantity: str, power: int):
     return lambda scales: _PROBE / max(scales[quantity], 1e-300) ** power
 
 
-def _frequency(tried: str) -> EffectParameter:
-    return shape(
-        "frequency",
-        "rad/s",
-        lambda scales: scales[tried],
-        lambda scales: 3.0 / scales["duration"],
-        lambda scales: 2.0 / scales["sample_period"],
-    )
+_FREQUENCY = shape(
+    "frequency",
+    "rad/s",
+    lambda scales: scales["frequencies"],
+    lambda scales: 3.0 / scales["duration"],
+    lambda scales: 2.0 / scales["sample_period"],
+)
 
 
 def _sign(velocity):
@@ -64,7 +63,7 @@ def _harmonic_parameters(unit):
     return (
         amplitude("cosine", unit, constant(_PROBE)),
         amplitude("sine", unit, constant(_PROBE)),
-        _frequency("frequencies"),
+        _FREQUENCY,
     )
 
 
@@ -258,7 +257,7 @@ FORCE = (
         (
             amplitude("cosine", "{value}/m", _per("position", 1)),
             amplitude("sine", "{value}/m", _per("position", 1)),
-            _frequency("modulations"),
+            _FREQUENCY,
         ),
         lambda own, context: -_harmonic(own, context) * context["position"],
         needs=("position",),
