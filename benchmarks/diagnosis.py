@@ -1,6 +1,6 @@
 """Does a diagnosis find what was hidden? Many records of independent plants, each with effects drawn at random.
 
-    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all] [--model all] [--seed 0]
+    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all] [--seed 0]
 
 The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
 kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an
@@ -33,7 +33,7 @@ import ehsvjax
 from ehsvjax.diagnose import Diagnosis, diagnose
 from ehsvjax.diagnose.missing import MissingTerm
 from tests.hidden_plants import effect_sizes
-from tests.hidden_records import TRUTH, Hidden, Made, best_rival, records, true_term, worth, worth_each
+from tests.hidden_records import TRUTH, Hidden, Made, oracle, records, true_term, worth_each
 
 matplotlib.use("Agg")
 
@@ -85,8 +85,8 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         hidden = trial.hidden
         row: dict[str, Any] = {"kind": trial.kind, **hidden._asdict(), "sizes": one.sizes}
         if trial.kind in ("one", "unknown") and hidden.names != ("process_noise",):
-            row["worth"] = worth(hidden, one)
-            row["rival_deficit"], row["rival"] = best_rival(hidden, one)
+            known = oracle(hidden, one)
+            row |= {"worth": known.worth, "rival_deficit": known.deficit, "rival": known.rival}
         if trial.kind == "two":
             row["worth_each"] = worth_each(hidden, one)
         key = jax.random.key(hidden.seed)
