@@ -121,8 +121,12 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
 
 
 def correlation(hidden: Hidden, made: Made, missing: MissingTerm) -> float:
-    """Correlate an estimated missing term with the true one along the record; none where the place is wrong."""
-    place, truth = true_term(hidden, made)
+    """Correlate an estimated missing term with the true one along the record; none where the place is wrong.
+
+    A servovalve's terms act through its flow: times count by the square of the opening, and a closed valve tells
+    nothing.
+    """
+    place, truth, acting = true_term(hidden, made)
     estimate = missing.series
     if missing.place == "damping":
         # As a force: the damping is proportional to 1 - x^2.
@@ -131,7 +135,8 @@ def correlation(hidden: Hidden, made: Made, missing: MissingTerm) -> float:
     # Both openings and supply pressures act on the flow, both damping and forces on the motion.
     if not any({place, missing.place} <= alike for alike in ({"opening", "supply"}, {"force", "damping"}, {place})):
         return 0.0
-    return float(np.corrcoef(estimate, truth)[0, 1])
+    moments = np.cov(estimate, truth, aweights=acting)
+    return float(moments[0, 1] / np.sqrt(max(moments[0, 0] * moments[1, 1], 1e-300)))
 
 
 def inside(d: Diagnosis, hidden: Hidden) -> list[bool]:

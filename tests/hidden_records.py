@@ -296,18 +296,22 @@ def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
     return tuple(worths)
 
 
-def true_term(hidden: Hidden, made: Made) -> tuple[str, np.ndarray]:
-    """Return where an effect that is in no bank acts, and the term along the record [time]: a force, or a share."""
+def true_term(hidden: Hidden, made: Made) -> tuple[str, np.ndarray, np.ndarray]:
+    """Return where an effect that is in no bank acts, the term, a force or a share, and how it acts, along the record.
+
+    How it acts is [time] the weight of each time: the square of the opening through which a valve's terms act.
+    """
     ((name, sizes),) = made.sizes.items()
     position, period = made.clean, excitation(hidden.model, 0)[1]
+    always = np.ones(len(position))
     if name == "unknown_bump":
-        return "force", sizes["force"] * np.exp(-0.5 * ((position - sizes["place"]) / sizes["width"]) ** 2)
+        return "force", sizes["force"] * np.exp(-0.5 * ((position - sizes["place"]) / sizes["width"]) ** 2), always
     if name == "unknown_step_damping":
-        return "force", -sizes["coefficient"] * (position > sizes["place"]) * np.gradient(position, period)
-    if name == "unknown_cogging":
-        return "load_force", sizes["force"] * np.sin(2.0 * np.pi * position / sizes["pitch"])
+        return "force", -sizes["coefficient"] * (position > sizes["place"]) * np.gradient(position, period), always
     spool = servovalve_with([made.sizes], made.command[None], period)["spool"][0]
-    if name == "unknown_spool_notch":
-        opening = np.clip(spool - np.clip(spool, -1e-4, 1e-4), -3e-3, 3e-3)
-        return "opening", -sizes["depth"] * np.exp(-0.5 * ((opening - sizes["place"]) / sizes["width"]) ** 2)
-    return "supply", -sizes["depth"] * np.exp(-0.5 * ((position - sizes["place"]) / sizes["width"]) ** 2)
+    opening = np.clip(spool - np.clip(spool, -1e-4, 1e-4), -3e-3, 3e-3)
+    if name == "unknown_cogging":
+        return "load_force", sizes["force"] * np.sin(2.0 * np.pi * position / sizes["pitch"]), opening**2
+    along = opening if name == "unknown_spool_notch" else position
+    term = -sizes["depth"] * np.exp(-0.5 * ((along - sizes["place"]) / sizes["width"]) ** 2)
+    return ("opening" if name == "unknown_spool_notch" else "supply"), term, opening**2

@@ -8,8 +8,8 @@ import numpy as np
 from ehsvjax.diagnose.missing import Dependence, MissingTerm, dependences, likelihood, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside
 from ehsvjax.diagnose.process_noise import CONVINCING, ProcessNoise, process_noise
-from ehsvjax.diagnose.rivals import INSEPARABLE
 from ehsvjax.diagnose.selection import SIGNIFICANT, Selection
+from ehsvjax.diagnose.significance import INSEPARABLE
 
 # Dependences that are followed up where something is left.
 _SUSPECTS = 8
@@ -119,7 +119,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[Miss
     r = white(selection.final.residual[0])
     price = float(np.log(len(r)))
     causes = likelihood(float(r @ r), len(r), white) - _numbers(selection) * price
-    as_well = term.likelihood + len(term.at) * price > causes - INSEPARABLE
+    as_well = term.likelihood + term.pieces * price > causes - INSEPARABLE
     return (term if as_well else None), term.likelihood > causes
 
 

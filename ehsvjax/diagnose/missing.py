@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of, span
-from ehsvjax.diagnose.significance import corrected, smallest_p_values
+from ehsvjax.diagnose.significance import INSEPARABLE, corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.models.model import Model
 
@@ -24,9 +24,17 @@ _COARSE, _CLOSE = 8, 24
 _SAMPLES_PER_PIECE = 60
 _FINE = (8, 14, 24, 40)
 _PROBE = 1e-3
-# Steps of the estimate of a curve, and shares of each step that are simulated.
+# Steps of the estimate of a curve, dampings of each that are simulated, and what the last one gains at most.
 _STEPS = 8
-_SHARES = (1.0, 0.5, 0.2, 0.05)
+_DAMPINGS = (0.0, 1e-4, 1e-2, 0.3)
+_SETTLED, _SETTLED_SHARE = 0.1, 1e-3
+# Of the smooth estimate: samples for each knot, and logarithms of the least and the largest weight of roughness.
+_SAMPLES_PER_KNOT = 50
+_LOG_SMOOTHNESS = (-25.0, 10.0)
+# Of an unknown's coordinate, for its derivative.
+_DIFFERENCE = 1e-6
+# Share of the strongest response of combined pieces below which a record shows nothing.
+_SHOWN = 1e-4
 TIME = "time"
 
 
@@ -63,7 +71,9 @@ class MissingTerm(NamedTuple):
         series: `[time]` the term along the record.
         relative: whether the estimate is a share of the value at the place.
         explained: share of the residual's sum of squares above the noise that it takes.
-        likelihood: twice its logarithm with this term, less Bayes' price for its pieces; for one output.
+        pieces: of a curve without smoothing that the record would pay for.
+        likelihood: twice its logarithm with that curve, less Bayes' price for its pieces; for one output.
+        alike: other places and quantities, by whose curves the record is explained as well, `(place, quantity)`.
 
     """
 
@@ -77,7 +87,9 @@ class MissingTerm(NamedTuple):
     series: Float[np.ndarray, " time"]
     relative: bool
     explained: float
+    pieces: int
     likelihood: float
+    alike: tuple[tuple[str, str], ...]
 
 
 class _Curve(NamedTuple):
@@ -175,10 +187,14 @@ def missing_term(
     seen: Mapping[str, Float[np.ndarray, " time"]],
     suspects: Sequence[Dependence],
 ) -> MissingTerm:
-    """Estimate the term that takes most of what is left, with as many pieces as it deserves (Bayes criterion).
+    """Estimate the term that takes most of what is left, at the place and along the quantity that explain most.
+
+    Places and quantities are compared by curves with as many pieces as they deserve (Bayes criterion). The estimate
+    that is returned has many pieces and is as smooth as the record says.
 
     Each suspect is estimated, put into the simulation, and estimated again, for a large term is not linear: the one
-    that then leaves least is it.
+    that then leaves least is it. Some make the same record by algebra (a load that depends on the opening alone is a
+    change of the opening): among those that explain alike, the one at whose place the quantity is at home.
     """
     known, r = _unexplained(final, white)
 
@@ -189,14 +205,19 @@ def missing_term(
         return attempt.left + len(attempt.coefficients) * np.log(len(r))
 
     attempts = [attempted(s.place, s.quantity, max(s.pieces, _FINE[0])) for s in suspects]
-    first = min(attempts, key=with_price)
+    least = min(with_price(a) for a in attempts)
+    alike = [a for a in attempts if with_price(a) < least + INSEPARABLE]
+    first = min(alike, key=lambda a: (a.curve.place != a.curve.quantity, with_price(a)))
     place, quantity = first.curve[:2]
     best = min([first, *(attempted(place, quantity, pieces) for pieces in _FINE)], key=with_price)
-    curve = best.curve
-    probe = _probe(bench, place)
-    estimate, deviation = best.coefficients * probe, np.sqrt(np.maximum(np.diag(best.covariance), 0.0)) * probe
+    knots = max(len(best.coefficients), len(r) // _SAMPLES_PER_KNOT)
+    finest = min(attempted(place, quantity, knots), best, key=lambda a: a.left)
+    curve, probe = finest.curve, _probe(bench, place)
+    smooth, covariance = _smoothed(finest)
+    estimate, deviation = smooth * probe, np.sqrt(np.maximum(np.diag(covariance), 0.0)) * probe
     excess = float(r @ r) - (len(r) - known.shape[1])
-    taken = float(r @ r) - best.left - len(estimate)
+    pieces = len(best.coefficients)
+    taken = float(r @ r) - best.left - pieces
     return MissingTerm(
         place=place,
         unit="" if curve.relative else bench.fit.model.unit(place),
@@ -208,7 +229,9 @@ def missing_term(
         series=estimate @ curve.pieces,
         relative=curve.relative,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
-        likelihood=likelihood(best.left, len(r), white) - len(estimate) * float(np.log(len(r))),
+        pieces=pieces,
+        likelihood=likelihood(best.left, len(r), white) - pieces * float(np.log(len(r))),
+        alike=tuple(dict.fromkeys(a.curve[:2] for a in alike if a.curve[:2] != (place, quantity))),
     )
 
 
@@ -218,41 +241,105 @@ def likelihood(left: float, count: int, white: Whitening) -> float:
 
 
 class _Attempt(NamedTuple):
-    """A curve with its coefficients, in probes, their covariance, and the sum of squares that it leaves."""
+    """A curve, where it has settled.
+
+    Attributes:
+        curve: its pieces.
+        coefficients: in probes.
+        left: the sum of squares of the whitened residual that it leaves.
+        residual: that residual.
+        responses: whitened, of each piece, outside of what the refitted unknowns can do.
+
+    """
 
     curve: _Curve
     coefficients: Float[np.ndarray, " piece"]
-    covariance: Float[np.ndarray, "piece piece"]
     left: float
+    residual: Float[np.ndarray, " sample"]
+    responses: Float[np.ndarray, "piece sample"]
 
 
 def _settled(bench: Workbench, final: Refits, white: Whitening, curve: _Curve) -> _Attempt:
-    """Estimate a curve together with the refitted unknowns, by steps that are simulated before they are taken."""
+    """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each."""
     samples = bench.problem.samples
     own = np.flatnonzero(final.chosen[0] >= 0)
     columns = final.chosen[0][own]
-    rows = np.concatenate([white(final.slopes[0][own]), white(_responses(bench, final.points[0], [curve]))])
     lower, upper = bounds_of(bench)
     point, coefficients = final.points[0].copy(), np.zeros(len(curve.pieces))
+    rows = np.concatenate([white(final.slopes[0][own]), white(_responses(bench, final.points[0], [curve]))])
     r = white(final.residual[0])
-    left, covariance = float(r @ r), np.zeros((len(curve.pieces),) * 2)
-    for _ in range(_STEPS):
-        step, whole = _least_squares(rows, r)
-        covariance = whole[len(own) :, len(own) :]
+    left = float(r @ r)
+    for step in range(_STEPS):
+        if step:
+            rows = white(_slopes(bench, point, columns, coefficients, curve))
         points, curves = [], []
-        for share in _SHARES:
+        for change in _damped_steps(rows, r):
             moved = point.copy()
-            moved[columns] = np.clip(point[columns] + share * step[: len(own)], lower[columns], upper[columns])
+            moved[columns] = np.clip(point[columns] + change[: len(own)], lower[columns], upper[columns])
             points.append(moved)
-            curves.append(coefficients + share * step[len(own) :])
-        outputs = _with_curve(bench, np.stack(points), np.stack(curves), curve)
-        residuals = white(samples.outputs - outputs)
+            curves.append(coefficients + change[len(own) :])
+        residuals = white(samples.outputs - _with_curve(bench, np.stack(points), np.stack(curves), curve))
         costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
         best = int(np.argmin(costs))
-        if not costs[best] < left - 0.1:
+        gain = left - costs[best]
+        if gain > 0:
+            point, coefficients, r, left = points[best], curves[best], residuals[best], float(costs[best])
+        if not gain > max(_SETTLED, _SETTLED_SHARE * left):
             break
-        point, coefficients, r, left = points[best], curves[best], residuals[best], float(costs[best])
-    return _Attempt(curve, coefficients, covariance, left)
+    known = span(rows[: len(own)])
+    responses = rows[len(own) :] - (rows[len(own) :] @ known) @ known.T
+    return _Attempt(curve, coefficients, left, r - known @ (known.T @ r), responses)
+
+
+def _smoothed(attempt: _Attempt) -> tuple[Float[np.ndarray, " piece"], Float[np.ndarray, "piece piece"]]:
+    """Return the coefficients of a curve that is as smooth as the record says, and their covariance, in probes.
+
+    Second derivatives are a priori normal numbers, whose variance has the largest marginal likelihood (Wahba 1985; the
+    same as restricted maximum likelihood). What refitted unknowns could do instead, such as a constant share of the
+    flow, cannot be told and is left out.
+    """
+    from scipy.optimize import minimize_scalar
+
+    knots = attempt.curve.knots
+    # A misfit that is left counts as noise.
+    variance = max(attempt.left / len(attempt.residual), 1.0)
+    information = attempt.responses @ attempt.responses.T / variance
+    along = attempt.responses @ attempt.residual / variance + information @ attempt.coefficients
+    apart = np.diff((knots - knots[0]) / (knots[-1] - knots[0]))
+    slopes = np.diff(np.eye(len(knots)), axis=0) / apart[:, None]
+    curvatures = np.diff(slopes, axis=0) / np.sqrt(0.5 * (apart[1:] + apart[:-1]))[:, None]
+    roughness = curvatures.T @ curvatures
+    scale = float(np.trace(information) / np.trace(roughness))
+
+    def solved(log_share):
+        values, vectors = np.linalg.eigh(information + np.exp(log_share) * scale * roughness)
+        told = values > _SHOWN**2 * values[-1]
+        covariance = (vectors[:, told] / values[told]) @ vectors[:, told].T
+        return covariance, float(np.sum(np.log(values[told])))
+
+    def cost(log_share):
+        covariance, volume = solved(log_share)
+        return volume - len(curvatures) * log_share - float(along @ covariance @ along)
+
+    shares = np.linspace(*_LOG_SMOOTHNESS, 25)
+    start = shares[int(np.argmin([cost(share) for share in shares]))]
+    width = shares[1] - shares[0]
+    best = minimize_scalar(cost, bounds=(start - width, start + width), method="bounded").x
+    covariance, _ = solved(best)
+    return covariance @ along, covariance
+
+
+def _slopes(bench: Workbench, point, columns, coefficients, curve: _Curve):
+    """Return the derivatives of the outputs by unknowns and by a curve's coefficients, while the curve acts."""
+    count = 1 + len(columns) + len(coefficients)
+    points, curves = np.repeat(point[None], count, axis=0), np.repeat(coefficients[None], count, axis=0)
+    unknowns = np.arange(len(columns))
+    points[1 + unknowns, columns] += _DIFFERENCE
+    curves[1 + len(columns) :] += np.eye(len(coefficients))
+    outputs = _with_curve(bench, points, curves, curve)
+    slopes = outputs[1:] - outputs[0]
+    slopes[: len(columns)] /= _DIFFERENCE
+    return slopes
 
 
 def _with_curve(bench: Workbench, points, coefficients, curve: _Curve):
@@ -352,14 +439,19 @@ def _outside(known, responses) -> Float[np.ndarray, "sample independent"]:
     return vectors[:, values > 1e-4 * max(values[0], 1e-300)] if len(values) else np.zeros((rows.shape[1], 0))
 
 
-def _least_squares(rows, r):
-    """Return coefficients and their covariance; what the record does not show at all is left at zero."""
+def _decomposed(rows):
+    """Return the singular vectors and values of responses of unit length, and these lengths' inverses."""
     norms = np.linalg.norm(rows, axis=1)
     scale = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
-    vectors, values, others = np.linalg.svd((rows * scale[:, None]).T, full_matrices=False)
-    inverse = np.where(values > 1e-4 * values[0], 1.0 / np.maximum(values, 1e-300), 0.0)
-    root = others.T * inverse
-    return scale * (root @ (vectors.T @ r)), (root @ root.T) * np.outer(scale, scale)
+    return *np.linalg.svd((rows * scale[:, None]).T, full_matrices=False), scale
+
+
+def _damped_steps(rows, r) -> list[Float[np.ndarray, " direction"]]:
+    """Return Levenberg-Marquardt steps of several dampings; what the record does not show at all stays where it is."""
+    vectors, values, others, scale = _decomposed(rows)
+    along = vectors.T @ r
+    shown = values > _SHOWN * values[0]
+    return [scale * (others.T @ (np.where(shown, values / (values**2 + d + 1e-300), 0.0) * along)) for d in _DAMPINGS]
 
 
 def quantity_unit(model: Model, name: str) -> str:

@@ -8,15 +8,10 @@ import numpy as np
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
+from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.trials import Trials, fits, refit_screened, refit_sets, without
 from ehsvjax.diagnose.workbench import REFINED_ABREAST
 
-INSEPARABLE = 3.0**2
-"""Likelihood ratio (noise variances) of two refits within which they explain a record alike.
-
-Where the true cause can be expected to be 5^2 better than a rival, chance brings the refits as near as 3^2 in 2% of
-all records (3.5^2 in 7%); a rival that is 3^2 better than the true cause is as rare as three standard deviations.
-"""
 PER_NUMBER = 4.0
 """Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
 _SWAPS = 3

@@ -94,6 +94,9 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             f"{m.at[peak]:.3g}{_spaced(m.quantity_unit)}; it takes {100 * m.explained:.0f}% of what is left "
             "(see .missing and .plot())"
         )
+        if m.alike:
+            others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
+            lines.append(f"a term {others} would explain as much")
     return lines
 
 
