@@ -93,21 +93,19 @@ def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent
     least = CONVINCING if before[0].corrected >= SIGNIFICANT else np.log(count)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > least:
         return None
-    if not innocent:
-        # A term that depends on what runs along the model is a better reason than chance.
-        term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
-        if term.likelihood > nominal.likelihood:
+    if selection.included:
+        final = process_noise(bench, selection.final)
+        assert final is not None
+        price = (_numbers(selection) - 1) * np.log(count)
+        # A single cause that leaves nothing unexplained has the first word.
+        margin = CONVINCING if innocent and len(selection.included) == 1 else 0.0
+        if not nominal.likelihood - final.of_sensor + price > margin:
             return None
-    if not selection.included:
+    if before[0].corrected >= SIGNIFICANT:
         return nominal
-    final = process_noise(bench, selection.final)
-    assert final is not None
-    price = (_numbers(selection) - 1) * np.log(count)
-    # A single cause that leaves nothing unexplained has the first word.
-    margin = CONVINCING if innocent and len(selection.included) == 1 else 0.0
-    if nominal.likelihood - final.of_sensor + price > margin:
-        return nominal
-    return None
+    # A term that depends on what runs along the model is a better reason than chance.
+    term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
+    return nominal if nominal.likelihood > term.likelihood else None
 
 
 def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[MissingTerm | None, bool]:

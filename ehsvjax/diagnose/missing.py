@@ -71,8 +71,8 @@ class MissingTerm(NamedTuple):
         series: `[time]` the term along the record.
         relative: whether the estimate is a share of the value at the place.
         explained: share of the residual's sum of squares above the noise that it takes.
-        pieces: of a curve without smoothing that the record would pay for.
-        likelihood: twice its logarithm with that curve, less Bayes' price for its pieces; for one output.
+        pieces: effective number of them, for smooth as it is.
+        likelihood: twice its logarithm with this term, less Bayes' price for its pieces; for one output.
         alike: other places and quantities, by whose curves the record is explained as well, `(place, quantity)`.
 
     """
@@ -87,7 +87,7 @@ class MissingTerm(NamedTuple):
     series: Float[np.ndarray, " time"]
     relative: bool
     explained: float
-    pieces: int
+    pieces: float
     likelihood: float
     alike: tuple[tuple[str, str], ...]
 
@@ -213,11 +213,10 @@ def missing_term(
     knots = max(len(best.coefficients), len(r) // _SAMPLES_PER_KNOT)
     finest = min(attempted(place, quantity, knots), best, key=lambda a: a.left)
     curve, probe = finest.curve, _probe(bench, place)
-    smooth, covariance = _smoothed(finest)
-    estimate, deviation = smooth * probe, np.sqrt(np.maximum(np.diag(covariance), 0.0)) * probe
+    smooth = _smoothed(finest)
+    estimate, deviation = smooth.coefficients * probe, smooth.deviation * probe
     excess = float(r @ r) - (len(r) - known.shape[1])
-    pieces = len(best.coefficients)
-    taken = float(r @ r) - best.left - pieces
+    taken = float(r @ r) - smooth.left - smooth.pieces
     return MissingTerm(
         place=place,
         unit="" if curve.relative else bench.fit.model.unit(place),
@@ -229,8 +228,8 @@ def missing_term(
         series=estimate @ curve.pieces,
         relative=curve.relative,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
-        pieces=pieces,
-        likelihood=likelihood(best.left, len(r), white) - pieces * float(np.log(len(r))),
+        pieces=smooth.pieces,
+        likelihood=likelihood(smooth.left, len(r), white) - smooth.pieces * float(np.log(len(r))),
         alike=tuple(dict.fromkeys(a.curve[:2] for a in alike if a.curve[:2] != (place, quantity))),
     )
 
@@ -291,8 +290,17 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: _Curve) -
     return _Attempt(curve, coefficients, left, r - known @ (known.T @ r), responses)
 
 
-def _smoothed(attempt: _Attempt) -> tuple[Float[np.ndarray, " piece"], Float[np.ndarray, "piece piece"]]:
-    """Return the coefficients of a curve that is as smooth as the record says, and their covariance, in probes.
+class _Smooth(NamedTuple):
+    """A smooth curve: coefficients and deviations, in probes, its effective pieces, the sum of squares it leaves."""
+
+    coefficients: Float[np.ndarray, " piece"]
+    deviation: Float[np.ndarray, " piece"]
+    pieces: float
+    left: float
+
+
+def _smoothed(attempt: _Attempt) -> _Smooth:
+    """Return a curve as smooth as the record says.
 
     Second derivatives are a priori normal numbers, whose variance has the largest marginal likelihood (Wahba 1985; the
     same as restricted maximum likelihood). What refitted unknowns could do instead, such as a constant share of the
@@ -326,7 +334,15 @@ def _smoothed(attempt: _Attempt) -> tuple[Float[np.ndarray, " piece"], Float[np.
     width = shares[1] - shares[0]
     best = minimize_scalar(cost, bounds=(start - width, start + width), method="bounded").x
     covariance, _ = solved(best)
-    return covariance @ along, covariance
+    coefficients = covariance @ along
+    residual = attempt.residual - (coefficients - attempt.coefficients) @ attempt.responses
+    return _Smooth(
+        coefficients,
+        np.sqrt(np.maximum(np.diag(covariance), 0.0)),
+        float(np.sum(covariance * information)),
+        # What the unknowns took beside the curve stays taken.
+        attempt.left + float(residual @ residual - attempt.residual @ attempt.residual),
+    )
 
 
 def _slopes(bench: Workbench, point, columns, coefficients, curve: _Curve):
