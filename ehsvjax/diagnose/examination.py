@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.diagnose.missing import Dependence, MissingTerm, dependences, likelihood, missing_term
+from ehsvjax.diagnose.dependence import Dependence, dependences
+from ehsvjax.diagnose.missing import MissingTerm, likelihood, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside
 from ehsvjax.diagnose.process_noise import CONVINCING, ProcessNoise, process_noise
 from ehsvjax.diagnose.selection import SIGNIFICANT, Selection

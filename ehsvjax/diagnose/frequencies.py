@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts, parts_at
-from ehsvjax.diagnose.refits import Refits, span
+from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import Candidate, Scales
 
@@ -36,9 +36,7 @@ def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts:
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
     period = float(bench.problem.samples.sample_period[0])
     duration = len(current.residual[0, 0]) * period
-    known = span(white(current.slopes[0]))
-    r = white(current.residual[0])
-    r = r - known @ (known.T @ r)
+    known, r = unexplained(current, white)
     scales: dict[str, Scales] = {}
     for candidate in bench.candidates:
         if not candidate.effect.harmonic:

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax.diagnose.dependence import Dependence
 from ehsvjax.diagnose.examination import Examination
-from ehsvjax.diagnose.missing import Dependence
 from ehsvjax.diagnose.noise import lattice
 from ehsvjax.precision.residual_noise import residual_noise
 

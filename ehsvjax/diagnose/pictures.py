@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ehsvjax.diagnose.curves import quantity_unit
 from ehsvjax.diagnose.diagnosis import Diagnosis
-from ehsvjax.diagnose.missing import quantity_unit
 from ehsvjax.plots import (
     _AXIS,
     _COMMAND,

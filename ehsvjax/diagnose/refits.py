@@ -51,6 +51,15 @@ def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sa
     return vectors[:, values > 1e-9 * values[0]]
 
 
+def unexplained(
+    final: Refits, white: Whitening
+) -> tuple[Float[np.ndarray, "sample independent"], Float[np.ndarray, " sample"]]:
+    """Return what the unknowns of a refit can do to first order, and its residual outside of that, both whitened."""
+    known = span(white(final.slopes[0]))
+    residual = white(final.residual[0])
+    return known, residual - known @ (known.T @ residual)
+
+
 def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
     """Return lists of columns side by side, filled up with -1."""
     return np.array([list(c) + [-1] * (width - len(c)) for c in columns])

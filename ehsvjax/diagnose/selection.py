@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.missing import strongest_dependence
+from ehsvjax.diagnose.dependence import strongest_dependence
 from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_of_all

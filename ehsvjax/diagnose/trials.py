@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnose.curves import curve_responses, curves_of_tests, quantities
 from ehsvjax.diagnose.frequencies import parts_of
-from ehsvjax.diagnose.missing import curve_responses, quantities
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts
 from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit, span
@@ -46,7 +46,8 @@ class Trials(NamedTuple):
 def trials_of(bench: Workbench, progress: Callable[[str], None]) -> Trials:
     """Simulate what terms of free form and parts of harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    return Trials(bench, seen, curve_responses(bench, bench.nominal, seen), parts_of(bench), {}, progress)
+    curves = curve_responses(bench, bench.nominal, curves_of_tests(bench, seen))
+    return Trials(bench, seen, curves, parts_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:

@@ -1,0 +1,68 @@
+"""Curves as smooth as the readings say: against curves that are known, and SciPy's smoothing spline."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import make_smoothing_spline
+
+from ehsvjax.diagnose.smoothing import smoothed
+
+KNOTS = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.09, 60)) - 1.0
+ALONG = np.random.default_rng(1).uniform(KNOTS[0], KNOTS[-1], 3000)
+HATS = np.stack([np.interp(ALONG, KNOTS, np.eye(len(KNOTS))[k]) for k in range(len(KNOTS))])
+
+
+def noise(seed, deviation=1.0):
+    return deviation * np.random.default_rng(seed).standard_normal(len(ALONG))
+
+
+@given(seed=st.integers(0, 10_000), size=st.floats(0.1, 100.0), slope=st.floats(-100.0, 100.0))
+@settings(max_examples=20, deadline=None)
+def test_a_straight_line_needs_two_pieces(seed, size, slope):
+    truth = size + slope * KNOTS
+    found = smoothed(KNOTS, HATS, truth @ HATS + noise(seed))
+    assert 1.99 < found.pieces < 8.0
+    assert np.max(np.abs(found.coefficients - truth) / found.deviation) < 6.0
+
+
+@pytest.mark.parametrize("size", [1.0, 5.0, 50.0])
+def test_a_bump_is_found_within_its_band(size):
+    truth = size * np.exp(-0.5 * ((KNOTS - 0.7) / 0.15) ** 2)
+    inside = []
+    for seed in range(20):
+        found = smoothed(KNOTS, HATS, truth @ HATS + noise(seed))
+        inside.append(np.abs(found.coefficients - truth) < 1.96 * found.deviation)
+        assert np.corrcoef(found.coefficients, truth)[0, 1] > 0.9
+    # Bayesian bands of curves cover 95% on average over the curve (Wahba 1983).
+    assert 0.88 < np.mean(inside) < 0.995
+
+
+def test_the_curve_is_near_that_of_a_smoothing_spline():
+    truth = 4.0 * np.sin(3.0 * ALONG)
+    readings = truth + noise(3)
+    at = np.linspace(KNOTS[0], KNOTS[-1], 150)
+    means = [readings[np.abs(ALONG - a) < 0.5 * (at[1] - at[0])].mean() for a in at]
+    spline = make_smoothing_spline(at, means)
+    found = smoothed(KNOTS, HATS, readings)
+    apart = np.sqrt(np.mean((found.coefficients - spline(KNOTS)) ** 2))
+    assert apart < 0.2
+    # Both are nearer to each other than the noise lets them be to the truth.
+    assert apart < 2.0 * np.sqrt(np.mean((spline(KNOTS) - 4.0 * np.sin(3.0 * KNOTS)) ** 2))
+
+
+def test_what_was_projected_out_is_left_out():
+    # Unknowns beside the curve can do a constant.
+    constant = np.ones(len(ALONG)) / np.sqrt(len(ALONG))
+    responses = HATS - np.outer(HATS @ constant, constant)
+    truth = 10.0 + 3.0 * KNOTS**2
+    found = smoothed(KNOTS, responses, truth @ responses + noise(4))
+    assert np.corrcoef(found.coefficients, truth)[0, 1] > 0.999
+    assert np.ptp(found.coefficients - truth) < 1.0
+    # It is not known where the curve begins, and nobody claims to.
+    assert abs(np.mean(found.coefficients)) < 10.0
+
+
+def test_noise_larger_than_said_does_not_roughen_the_curve():
+    found = smoothed(KNOTS, HATS, 2.0 * KNOTS @ HATS + noise(5, deviation=20.0))
+    assert found.pieces < 8.0
