@@ -4,7 +4,7 @@ What an effect does at some frequency is the sum of what it does in short parts 
 simulated once only. Frequencies too high for the parts are looked for in the residual itself.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import jax
@@ -32,7 +32,7 @@ def parts_of(bench: Workbench) -> dict[str, Parts]:
     return {place: parts_at(bench, bench.nominal, place) for place in places}
 
 
-def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts: dict[str, Parts]) -> Workbench:
+def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts: Mapping[str, Parts]) -> Workbench:
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
     period = float(bench.problem.samples.sample_period[0])
     duration = len(current.residual[0, 0]) * period

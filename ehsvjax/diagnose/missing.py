@@ -13,7 +13,6 @@ from jaxtyping import Float
 from ehsvjax.diagnose.curves import (
     Curve,
     curve_along,
-    curve_responses,
     outputs_with,
     probe_at,
     quantity_unit,
@@ -26,8 +25,7 @@ from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.smoothing import smoothed
 from ehsvjax.diagnose.workbench import Workbench
 
-# Pieces of a curve that are compared, and samples for each knot of the smooth one.
-_FINE = (8, 14, 24, 40)
+# For each knot of the smooth curve.
 _SAMPLES_PER_KNOT = 50
 # Steps of the estimate of a curve, dampings of each that are simulated, and what the last one gains at most.
 _STEPS = 8
@@ -79,29 +77,26 @@ def missing_term(
 ) -> MissingTerm:
     """Estimate the term that takes most of what is left, at the place and along the quantity that explain most.
 
-    Places and quantities are compared by curves with as many pieces as they deserve (Bayes criterion). The estimate
-    that is returned has many pieces and is as smooth as the record says.
-
     Each suspect is estimated, put into the simulation, and estimated again, for a large term is not linear: the one
-    that then leaves least is it. Some make the same record by algebra (a load that depends on the opening alone is a
-    change of the opening): among those that explain alike, the one at whose place the quantity is at home.
+    that then leaves least, the price of its pieces paid, is it. Some make the same record by algebra (a load that
+    depends on the opening alone is a change of the opening): among those that explain alike, the one at whose place the
+    quantity is at home. What is returned has many pieces and is as smooth as the record says.
     """
     known, r = unexplained(final, white)
 
-    def attempted(place, quantity, pieces):
-        return _settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces))
+    def attempted(place, quantity, pieces, start=None):
+        return _settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start)
 
     def with_price(attempt):
         return attempt.left + len(attempt.coefficients) * np.log(len(r))
 
-    attempts = [attempted(s.place, s.quantity, max(s.pieces, _FINE[0])) for s in suspects]
+    attempts = [attempted(s.place, s.quantity, s.pieces) for s in suspects]
     least = min(with_price(a) for a in attempts)
     alike = [a for a in attempts if with_price(a) < least + INSEPARABLE]
     first = min(alike, key=lambda a: (a.curve.place != a.curve.quantity, with_price(a)))
     place, quantity = first.curve[:2]
-    best = min([first, *(attempted(place, quantity, pieces) for pieces in _FINE)], key=with_price)
-    knots = max(len(best.coefficients), len(r) // _SAMPLES_PER_KNOT)
-    finest = min(attempted(place, quantity, knots), best, key=lambda a: a.left)
+    knots = max(len(first.coefficients), len(r) // _SAMPLES_PER_KNOT)
+    finest = min(attempted(place, quantity, knots, first), first, key=lambda a: a.left)
     curve, probe = finest.curve, probe_at(bench, place)
     smooth = smoothed(curve.knots, finest.responses, finest.readings)
     # What the unknowns took beside the curve stays taken.
@@ -136,6 +131,7 @@ class _Attempt(NamedTuple):
 
     Attributes:
         curve: its pieces.
+        point: `[parameter]` of the unknowns beside it.
         coefficients: in probes.
         left: the sum of squares of the whitened residual that it leaves.
         readings: whitened: that residual with what the curve explains, outside of what the refitted unknowns can do.
@@ -144,32 +140,36 @@ class _Attempt(NamedTuple):
     """
 
     curve: Curve
+    point: Float[np.ndarray, " parameter"]
     coefficients: Float[np.ndarray, " piece"]
     left: float
     readings: Float[np.ndarray, " sample"]
     responses: Float[np.ndarray, "piece sample"]
 
 
-def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve) -> _Attempt:
-    """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each."""
-    samples = bench.problem.samples
-    own = np.flatnonzero(final.chosen[0] >= 0)
-    columns = final.chosen[0][own]
+def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, start: _Attempt | None) -> _Attempt:
+    """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each.
+
+    It starts where another curve at the same place has settled, or without any.
+    """
+    readings = bench.problem.samples.outputs
+    columns = final.chosen[0][final.chosen[0] >= 0]
     lower, upper = bounds_of(bench)
-    point, coefficients = final.points[0].copy(), np.zeros(len(curve.pieces))
-    rows = np.concatenate([white(final.slopes[0][own]), white(curve_responses(bench, final.points[0], [curve]))])
-    r = white(final.residual[0])
-    left = float(r @ r)
-    for step in range(_STEPS):
-        if step:
-            rows = white(slopes_with(bench, point, columns, coefficients, curve))
+    point, coefficients = final.points[0], np.zeros(len(curve.pieces))
+    if start is not None:
+        point, coefficients = start.point, np.interp(curve.knots, start.curve.knots, start.coefficients)
+    r = white(readings - outputs_with(bench, point[None], coefficients[None], curve)[0])
+    left = float(np.nan_to_num(r @ r, nan=np.inf))
+    rows = np.zeros((0, len(r)))
+    for _ in range(_STEPS):
+        rows = white(slopes_with(bench, point, columns, coefficients, curve))
         points, curves = [], []
         for change in _damped_steps(rows, r):
             moved = point.copy()
-            moved[columns] = np.clip(point[columns] + change[: len(own)], lower[columns], upper[columns])
+            moved[columns] = np.clip(point[columns] + change[: len(columns)], lower[columns], upper[columns])
             points.append(moved)
-            curves.append(coefficients + change[len(own) :])
-        residuals = white(samples.outputs - outputs_with(bench, np.stack(points), np.stack(curves), curve))
+            curves.append(coefficients + change[len(columns) :])
+        residuals = white(readings - outputs_with(bench, np.stack(points), np.stack(curves), curve))
         costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
         best = int(np.argmin(costs))
         gain = left - costs[best]
@@ -177,10 +177,9 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve) ->
             point, coefficients, r, left = points[best], curves[best], residuals[best], float(costs[best])
         if not gain > max(_SETTLED, _SETTLED_SHARE * left):
             break
-    known = span(rows[: len(own)])
-    responses = rows[len(own) :] - (rows[len(own) :] @ known) @ known.T
-    readings = r - known @ (known.T @ r) + coefficients @ responses
-    return _Attempt(curve, coefficients, left, readings, responses)
+    known = span(rows[: len(columns)])
+    responses = rows[len(columns) :] - (rows[len(columns) :] @ known) @ known.T
+    return _Attempt(curve, point, coefficients, left, r - known @ (known.T @ r) + coefficients @ responses, responses)
 
 
 def _decomposed(rows):

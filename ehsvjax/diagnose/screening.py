@@ -18,7 +18,7 @@ from jaxtyping import Float
 from ehsvjax.diagnose.frequencies import with_frequencies
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts
-from ehsvjax.diagnose.refits import Refits, bounds_of, span
+from ehsvjax.diagnose.refits import Refits, bounds_of, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import UNLIMITED, Candidate
@@ -169,12 +169,10 @@ def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening
     """
     from scipy.special import ndtri
 
-    r = white(current.residual[0])
-    known = span(white(current.slopes[0]))
+    known, r = unexplained(current, white)
     g = white(tried.changes)
     whole = np.linalg.norm(g, axis=1)
     g = g - (g @ known) @ known.T
-    r = r - known @ (known.T @ r)
     left = np.linalg.norm(g, axis=1)
     survives = left > _SURVIVES * np.maximum(whole, 1e-300)
     bases, row = [], 0
