@@ -32,6 +32,8 @@ EXACTLY_ALIKE = {
         "constant_force": "input_bias",
     },
 }
+# Of quantised noise, in deviations of the noise: nothing is hidden in a record whose readings are as coarse as that.
+COARSEST = 2.0
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
 # Sizes of these are never negative.
@@ -190,7 +192,7 @@ def records(hidden: Sequence[Hidden], samples: int | None = None) -> list[Made]:
     commands = np.stack([excitation(model, s)[0] for s in seeds])[:, :samples]
     noises = np.stack([noise_of(h, rng, commands.shape[1]) for h, rng in zip(hidden, rngs, strict=True)])
     steps = [
-        float(rng.uniform(0.2, 2.0)) * h.variance**0.5 if h.noise == "quantised" else 0.0
+        float(rng.uniform(0.2, COARSEST)) * h.variance**0.5 if h.noise == "quantised" else 0.0
         for h, rng in zip(hidden, rngs, strict=True)
     ]
     # With noise and without, side by side.
@@ -259,6 +261,8 @@ def oracle(hidden: Hidden, made: Made) -> Oracle:
     size = float(left @ left) / hidden.variance
     unit = left / max(np.linalg.norm(left), 1e-300)
     (name,) = hidden.names
+    if name == "sensor_quantisation" and made.sizes[name]["step"] < COARSEST * hidden.variance**0.5:
+        return Oracle(size, 0.0, "quantised noise")
     if name in EXACTLY_ALIKE[hidden.model]:
         return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][name])
     every = library(hidden.model, made.excitation, len(made.time))
