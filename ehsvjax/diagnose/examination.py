@@ -25,6 +25,7 @@ class Examination(NamedTuple):
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
         chance: the random force that explains the nominal model's residual better than any cause; None if none does.
+        or_chance: whether a random force explains it about as well as the single cause.
         instead: one term of free form that explains the record as well as several causes together, but for the price
             of its pieces; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -36,6 +37,7 @@ class Examination(NamedTuple):
     after: tuple[Dependence, ...]
     innocent: bool
     chance: ProcessNoise | None
+    or_chance: bool
     instead: MissingTerm | None
     lacking: bool
 
@@ -48,12 +50,12 @@ def examine(selection: Selection) -> Examination:
     if selection.included:
         before = dependences(bench, selection.nominal, selection.white, selection.seen)
     innocent = not _depends(selection, after)
-    chance = _random_force(selection, before, innocent)
+    chance, or_chance = _random_force(selection, before, innocent)
     if chance is not None:
         selection, after, innocent = selection.without_causes(), before, True
     if innocent:
         selection = replace(selection, white=_own_noise(selection))
-    return Examination(selection, before, after, innocent, chance, *_instead(selection, before))
+    return Examination(selection, before, after, innocent, chance, or_chance, *_instead(selection, before))
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
@@ -82,31 +84,33 @@ def _own_noise(selection: Selection) -> Whitening:
     return noise_outside(final.residual[0], selection.bench.problem.samples.measured, final.slopes[0])
 
 
-def _random_force(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> ProcessNoise | None:
+def _random_force(
+    selection: Selection, before: tuple[Dependence, ...], innocent: bool
+) -> tuple[ProcessNoise | None, bool]:
     """Return the random force that explains the nominal model's residual better than any cause, if there is one.
 
-    What the causes seemed to explain was then the motion that the force had left behind.
+    What the causes seemed to explain was then the motion that the force had left behind. And whether a random force
+    explains it about as well as a single cause.
     """
     bench = selection.bench
-    count = bench.problem.samples.measured.sum()
     nominal = process_noise(bench, selection.nominal)
-    # Where the residual depends on something, the force need not show that there is something: one number's price.
-    least = CONVINCING if before[0].corrected >= SIGNIFICANT else np.log(count)
-    if nominal is None or not nominal.likelihood - nominal.of_sensor > least:
-        return None
+    if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
+        return None, False
     if selection.included:
         final = process_noise(bench, selection.final)
         assert final is not None
-        price = (_numbers(selection) - 1) * np.log(count)
+        price = (_numbers(selection) - 1) * np.log(bench.problem.samples.measured.sum())
+        better = nominal.likelihood - final.of_sensor + price
         # A single cause that leaves nothing unexplained has the first word.
-        margin = CONVINCING if innocent and len(selection.included) == 1 else 0.0
-        if not nominal.likelihood - final.of_sensor + price > margin:
-            return None
-    if before[0].corrected >= SIGNIFICANT:
-        return nominal
-    # A term that depends on what runs along the model is a better reason than chance.
-    term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
-    return nominal if nominal.likelihood > term.likelihood else None
+        single = innocent and len(selection.included) == 1
+        if not better > (CONVINCING if single else 0.0):
+            return None, single and better > -INSEPARABLE
+    if before[0].corrected < SIGNIFICANT:
+        # A term that depends on what runs along the model is a better reason than chance.
+        term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
+        if term.likelihood > nominal.likelihood:
+            return None, False
+    return nominal, False
 
 
 def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[MissingTerm | None, bool]:

@@ -12,7 +12,7 @@ from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
-from ehsvjax.diagnose.trials import Trials, fits, refit_screened, refit_sets, trials_of, without
+from ehsvjax.diagnose.trials import Trials, fits, refit_reshaped, refit_screened, refit_sets, trials_of, without
 from ehsvjax.diagnose.workbench import REFINED_ABREAST, Workbench
 
 SIGNIFICANT = 0.002
@@ -155,10 +155,20 @@ def _next_effect(trials: Trials, stage: Stage) -> Stage | None:
         if not _is_gain(trials, stage, refitted.best(chosen), candidate):
             continue
         best = _look(trials, (*stage.included, candidate), refitted.best(chosen))
-        left = best.screening.ranked
-        if not left or left[0].corrected >= SIGNIFICANT:
+        if not _leaves_something(best):
             break
+        reshaped = refit_reshaped(trials, best.current, best.included, candidate, best.white)
+        if reshaped is not best.current:
+            best = _look(trials, best.included, reshaped)
+            if not _leaves_something(best):
+                break
     return best
+
+
+def _leaves_something(stage: Stage) -> bool:
+    """Whether a candidate is significant on what a stage leaves."""
+    left = stage.screening.ranked
+    return bool(left) and left[0].corrected < SIGNIFICANT
 
 
 def _cost_under(refits: Refits, white: Whitening) -> float:

@@ -21,6 +21,9 @@ _OWN_NUMBERS = 6
 # Shares of a linear estimate of an effect from which it is refitted too.
 _SHARES = (2.0, 1.4, 0.7, 0.5, 0.35, 0.2, 0.1, 0.02)
 
+# Multiples of an effect's shape from which it is refitted too.
+_SHAPES = (0.25, 0.5, 0.7, 1.4, 2.0, 4.0)
+
 
 class Trials(NamedTuple):
     """What every step of the search for causes needs.
@@ -88,6 +91,34 @@ def refit_screened(
     """Refit each screened candidate beside the effects that are there already, from the refit without it."""
     starts = _best_of(trials.bench, [_starts(trials.bench, s) for s in some], white, current)
     return refit_sets(trials, list(starts), [(*rest, s.candidate) for s in some], white, race=True)
+
+
+def refit_reshaped(
+    trials: Trials, current: Refits, included: Sequence[int], candidate: int, white: Whitening
+) -> Refits:
+    """Refit from other shapes of one effect, if one leads lower: a stop's place and stiffness have many local minima.
+
+    Frequencies are searched elsewhere.
+    """
+    bench = trials.bench
+    effect = bench.candidates[candidate].effect
+    shapes = [n for n in effect.parameters if n.absent is None and not effect.harmonic]
+    lower, upper = bounds_of(bench)
+    starts = []
+    for number, factor in itertools.product(shapes, _SHAPES):
+        j = bench.column[bench.candidates[candidate].parameter(number.name)]
+        start = current.points[0].copy()
+        start[j] = np.clip(factor * start[j], lower[j], upper[j])
+        starts.append(start)
+    if not starts:
+        return current
+    columns = padded([bench.columns_with(included)] * len(starts), most_unknowns(bench))
+    found = refit(bench, np.stack(starts), columns, white)
+    best = found.best(int(np.argmin(found.cost)))
+    if not best.cost[0] < current.cost[0]:
+        return current
+    trials.reached[frozenset(included)] = best.points[0]
+    return best
 
 
 def without(

@@ -30,6 +30,8 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
     causes = tuple(group[0] for group in groups) + _quantised(misfit) + ((PROCESS_NOISE,) if examined.chance else ())
     if not causes:
         return "adequate", (), ()
+    if examined.or_chance:
+        groups[0] = (*groups[0], PROCESS_NOISE)
     alternatives = tuple(Alternative(g, _settled_by(selection.bench, g)) for g in groups if len(g) > 1)
     return ("ambiguous" if alternatives else "named"), causes, alternatives
 
@@ -44,4 +46,5 @@ def _quantised(misfit: Misfit) -> tuple[str, ...]:
 
 def _settled_by(bench: Workbench, group: tuple[str, ...]) -> str:
     ways = {c.name: c.effect.settled_by for c in bench.candidates if c.effect.settled_by}
+    ways[PROCESS_NOISE] = "the same experiment again: chance does not repeat itself"
     return "; ".join(dict.fromkeys(f"{name}: {ways[name]}" for name in group if name in ways))
