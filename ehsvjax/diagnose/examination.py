@@ -104,7 +104,7 @@ def _random_force(
         # A single cause that leaves nothing unexplained has the first word.
         single = innocent and len(selection.included) == 1
         if not better > (CONVINCING if single else 0.0):
-            return None, single and better > -INSEPARABLE
+            return None, bool(single and better > -INSEPARABLE)
     if before[0].corrected < SIGNIFICANT:
         # A term that depends on what runs along the model is a better reason than chance.
         term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
