@@ -1,6 +1,7 @@
 """Does a diagnosis find what was hidden? Many records of independent plants, each with effects drawn at random.
 
-    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all] [--seed 0]
+    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all]
+                                   [--model all] [--seed 0]
 
 The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
 kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an

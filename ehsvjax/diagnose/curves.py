@@ -104,9 +104,8 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
     added = np.zeros((1 + sum(len(c.pieces) for c in inside), *samples.outputs.shape[:2], len(bench.places)))
     row = 1
     for curve in inside:
-        size = bench.internal.values[curve.place] if curve.relative else 1.0
-        place = bench.places.index(curve.place)
-        added[row : row + len(curve.pieces), 0, :, place] = probe_at(bench, curve.place) * curve.pieces * size
+        acting = _acting(bench, curve, curve.pieces)
+        added[row : row + len(curve.pieces), 0, :, bench.places.index(curve.place)] = acting
         row += len(curve.pieces)
     outputs = bench.simulated(np.repeat(point[None], len(added), axis=0), added) if inside else None
     changes, row = [], 1
@@ -117,7 +116,7 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
             row += len(curve.pieces)
         else:
             sensed = np.zeros((len(curve.pieces), *samples.outputs.shape))
-            sensed[:, 0, :, bench.problem.observed.index(curve.place)] = _PROBE * curve.pieces
+            sensed[:, 0, :, bench.problem.observed.index(curve.place)] = _acting(bench, curve, curve.pieces)
             changes.append(sensed)
     return np.concatenate(changes)
 
@@ -125,15 +124,20 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
 def outputs_with(bench: Workbench, points, coefficients, curve: Curve):
     """Return the outputs of points with a curve acting at its place."""
     shape = bench.problem.samples.outputs.shape
-    series = probe_at(bench, curve.place) * (coefficients @ curve.pieces)
+    acting = _acting(bench, curve, coefficients @ curve.pieces)
     if curve.place not in bench.places:
         outputs = bench.simulated(points)
-        outputs[:, 0, :, bench.problem.observed.index(curve.place)] += series
+        outputs[:, 0, :, bench.problem.observed.index(curve.place)] += acting
         return outputs
     added = np.zeros((len(points), *shape[:2], len(bench.places)))
-    size = bench.internal.values[curve.place] if curve.relative else 1.0
-    added[:, 0, :, bench.places.index(curve.place)] = series * size
+    added[:, 0, :, bench.places.index(curve.place)] = acting
     return bench.simulated(points, added)
+
+
+def _acting(bench: Workbench, curve: Curve, probes: Float[np.ndarray, "*batch time"]):
+    """Return what a curve adds to the value at its place, from its probes along the record."""
+    size = bench.internal.values[curve.place] if curve.relative else 1.0
+    return probe_at(bench, curve.place) * probes * size
 
 
 def slopes_with(bench: Workbench, point, columns, coefficients, curve: Curve):

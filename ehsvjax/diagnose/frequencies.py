@@ -41,7 +41,9 @@ def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts:
     for candidate in bench.candidates:
         if not candidate.effect.harmonic:
             continue
-        lowest, highest = 3.0 / duration, 2.0 / period
+        own = bench.scales[candidate.name]
+        (frequency,) = (p for p in candidate.effect.parameters if p.name == "frequency")
+        lowest, highest = frequency.lower(own), frequency.upper(own)
         peaks: list[tuple[float, float]] = []
         if _by_parts(bench, candidate):
             there = parts[candidate.signal]
@@ -50,8 +52,7 @@ def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts:
             peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, white, known, r, there))
             lowest = edge
         peaks += _peaks(*_periodogram(bench, current, lowest, highest))
-        found = _strongest(peaks, duration)
-        scales[candidate.name] = {**bench.scales[candidate.name], "frequencies": found or (2.0 * np.pi / duration,)}
+        scales[candidate.name] = {**own, "frequencies": _strongest(peaks, duration) or own["frequencies"]}
     return replace(bench, scales={**bench.scales, **scales})
 
 
@@ -76,7 +77,7 @@ def _explained(
 def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
     """Return what each of an effect's amplitudes adds to its signal in each part, `[frequency, amplitude, part]`."""
     numbers = candidate.effect.parameters
-    scales = {**bench.scales[candidate.name], "frequencies": (1.0,)}
+    scales = bench.scales[candidate.name]
     amplitudes = [n for n in numbers if n.absent is not None]
     absent = {n.name: n.absent if n.absent is not None else n.tries(scales)[0] for n in numbers}
     internal = bench.internal

@@ -160,7 +160,6 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, st
         point, coefficients = start.point, np.interp(curve.knots, start.curve.knots, start.coefficients)
     r = white(readings - outputs_with(bench, point[None], coefficients[None], curve)[0])
     left = float(np.nan_to_num(r @ r, nan=np.inf))
-    rows = np.zeros((0, len(r)))
     for _ in range(_STEPS):
         rows = white(slopes_with(bench, point, columns, coefficients, curve))
         points, curves = [], []
