@@ -18,8 +18,6 @@ from ehsvjax.models.model import Model
 _COARSE, _CLOSE = 8, 24
 _SAMPLES_PER_PIECE = 60
 _PROBE = 1e-3
-# Of an unknown's coordinate, for its derivative.
-_DIFFERENCE = 1e-6
 TIME = "time"
 
 
@@ -145,11 +143,11 @@ def slopes_with(bench: Workbench, point, columns, coefficients, curve: Curve):
     count = 1 + len(columns) + len(coefficients)
     points, curves = np.repeat(point[None], count, axis=0), np.repeat(coefficients[None], count, axis=0)
     unknowns = np.arange(len(columns))
-    points[1 + unknowns, columns] += _DIFFERENCE
+    points[1 + unknowns, columns] += bench.differences[columns]
     curves[1 + len(columns) :] += np.eye(len(coefficients))
     outputs = outputs_with(bench, points, curves, curve)
     slopes = outputs[1:] - outputs[0]
-    slopes[: len(columns)] /= _DIFFERENCE
+    slopes[: len(columns)] /= bench.differences[columns, None, None, None]
     return slopes
 
 

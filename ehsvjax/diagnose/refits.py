@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
 _ITERATIONS = 30
@@ -48,7 +48,7 @@ def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sa
     if not len(kept):
         return np.zeros((slopes.shape[1], 0))
     vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
-    return vectors[:, values > 1e-9 * values[0]]
+    return vectors[:, values > TOLD_APART * values[0]]
 
 
 def unexplained(
@@ -167,7 +167,7 @@ def _step(point, chosen, gradient, information, damping, lower, upper):
     scale = 1.0 / np.sqrt(np.diag(information)[free])
     scaled = information[np.ix_(free, free)] * scale[:, None] * scale
     values, vectors = np.linalg.eigh(scaled)
-    fixed = values > len(values) * np.finfo(float).eps * values[-1]
+    fixed = values > TOLD_APART**2 * values[-1]
     inverse = np.where(fixed, 1.0 / (np.where(fixed, values, 1.0) + damping), 0.0)
     moved = scale * (vectors @ (inverse * (vectors.T @ (scale * gradient[free]))))
     own = chosen[free]

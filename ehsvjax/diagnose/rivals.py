@@ -9,8 +9,7 @@ from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.significance import INSEPARABLE
-from ehsvjax.diagnose.trials import Trials, fits, refit_screened, refit_sets, without
-from ehsvjax.diagnose.workbench import REFINED_ABREAST
+from ehsvjax.diagnose.trials import REFITTED_TOGETHER, Trials, fits, refit_screened, refit_sets, without
 
 PER_NUMBER = 4.0
 """Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
@@ -79,13 +78,13 @@ def _close(ranked: Sequence[Screened], own: int) -> list[Screened]:
     """Return the candidates whose response is most like that of one effect, itself among them."""
     mine = next((s for s in ranked if s.candidate == own), None)
     if mine is None:
-        return list(ranked[:REFINED_ABREAST])
+        return list(ranked[:REFITTED_TOGETHER])
     alike = sorted(ranked, key=lambda s: -abs(float(s.response @ mine.response)))
-    strongest = [s for s in ranked[: REFINED_ABREAST // 2] if s.candidate != own]
+    strongest = [s for s in ranked[: REFITTED_TOGETHER // 2] if s.candidate != own]
     chosen = {s.candidate: s for s in [mine, *strongest]}
     for s in alike:
         # What a rival's refit could at most reach, to first order.
         deficit = mine.score**2 * (1.0 - float(s.response @ mine.response) ** 2)
-        if len(chosen) < REFINED_ABREAST or (deficit < _WORTH_A_REFIT and len(chosen) < 2 * REFINED_ABREAST):
+        if len(chosen) < REFITTED_TOGETHER or (deficit < _WORTH_A_REFIT and len(chosen) < 2 * REFITTED_TOGETHER):
             chosen.setdefault(s.candidate, s)
     return list(chosen.values())

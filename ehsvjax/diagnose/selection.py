@@ -12,8 +12,17 @@ from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
-from ehsvjax.diagnose.trials import Trials, fits, refit_reshaped, refit_screened, refit_sets, trials_of, without
-from ehsvjax.diagnose.workbench import REFINED_ABREAST, Workbench
+from ehsvjax.diagnose.trials import (
+    REFITTED_TOGETHER,
+    Trials,
+    fits,
+    refit_reshaped,
+    refit_screened,
+    refit_sets,
+    trials_of,
+    without,
+)
+from ehsvjax.diagnose.workbench import Workbench
 
 SIGNIFICANT = 0.002
 """Corrected p-value of the whole search below which an effect is taken to be there."""
@@ -138,8 +147,8 @@ def _next_effect(trials: Trials, stage: Stage) -> Stage | None:
     best: Stage | None = None
     without_form = strongest_dependence(bench, stage.current, stage.white, trials.seen)
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
-    for first in range(0, min(len(hopeful), 2 * REFINED_ABREAST), REFINED_ABREAST):
-        some = hopeful[first : first + REFINED_ABREAST]
+    for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
+        some = hopeful[first : first + REFITTED_TOGETHER]
         names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
         trials.progress(f"refitting the model with {names}{', ...' if len(some) > 3 else ''}")
         refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)

@@ -16,6 +16,8 @@ from ehsvjax.diagnose.screening import Screened
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
+REFITTED_TOGETHER = 8
+"""Candidates that are refitted in one race."""
 # Numbers of effects that can be refitted besides the model's unknowns.
 _OWN_NUMBERS = 6
 # Shares of a linear estimate of an effect from which it is refitted too.

@@ -5,7 +5,9 @@ of the initial conditions. What is tried differs in its data only, so that nothi
 """
 
 import functools
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import jax
@@ -24,9 +26,12 @@ from ehsvjax.unknowns import problem_of
 
 # Kinds of signals at which a missing term is looked for.
 PLACES = ("force", "load", "opening", "supply", "damping", "displacement")
-# Simulated side by side, of those that are compared and of those that are refined.
+# Simulated side by side.
 _ABREAST = 16
-REFINED_ABREAST = 8
+# Of coordinates, for derivatives. An effect's size may count so little in its own that rounding would drown it.
+_DIFFERENCE, _DIFFERENCE_OF_SIZE = 1e-6, 1e-4
+TOLD_APART = 3e-5
+"""Part of derivatives, relative to the largest, below which differences cannot tell them from zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +48,7 @@ class Workbench:
         places: signals that can be disturbed by a series.
         column: name of an unknown -> its column; initial conditions are `name[record]`.
         nominal: `[parameter]` the point at which every effect is absent.
+        differences: `[parameter]` of coordinates, for derivatives.
 
     """
 
@@ -55,6 +61,7 @@ class Workbench:
     places: tuple[str, ...]
     column: dict[str, int]
     nominal: Float[np.ndarray, " parameter"]
+    differences: Float[np.ndarray, " parameter"]
 
     @property
     def base_columns(self) -> list[int]:
@@ -85,42 +92,43 @@ class Workbench:
     ) -> Float[np.ndarray, "individual record time signal"]:
         """Return the outputs of each point, SI, with what is added to signals while they run."""
         shape = (*self.problem.samples.inputs.shape[:2], len(self.places))
-        rows = []
-        with jax.enable_x64(True):
-            problem = cast(self.problem, jnp.float64)
-            for first in range(0, len(points), _ABREAST):
-                some = points[first : first + _ABREAST]
-                added = np.zeros((_ABREAST, *shape))
-                if disturbances is not None:
-                    added[: len(some)] = disturbances[first : first + _ABREAST]
-                filled = _filled(some, _ABREAST)
-                rows.append(np.asarray(_simulated(problem, jnp.asarray(filled), jnp.asarray(added)))[: len(some)])
-        return np.concatenate(rows)
+
+        def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
+            some = points[first : first + _ABREAST]
+            added = np.zeros((_ABREAST, *shape))
+            if disturbances is not None:
+                added[: len(some)] = disturbances[first : first + _ABREAST]
+            # The setting is that of a thread.
+            with jax.enable_x64(True):
+                problem = cast(self.problem, jnp.float64)
+                filled = jnp.asarray(_filled(some, _ABREAST))
+                return np.asarray(_simulated(problem, filled, jnp.asarray(added)))[: len(some)]
+
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            return np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
 
     def linearised(
         self, points: Float[np.ndarray, "individual parameter"], chosen: Int[np.ndarray, "individual direction"]
     ):
         """Return outputs `[individual, record, time, signal]` and their derivatives `[direction, individual, ...]`.
 
+        The derivatives are differences, right to some 1e-5 of each, 1e-3 of an effect that hardly shows: what is
+        derived is simulated as everything else, and nothing more is compiled.
+
         Args:
-            points: at most `REFINED_ABREAST` of them are computed side by side.
+            points: where.
             chosen: columns along which to differentiate; -1 gives zero.
 
         """
-        outputs, slopes = [], []
-        with jax.enable_x64(True):
-            problem = cast(self.problem, jnp.float64)
-            for first in range(0, len(points), REFINED_ABREAST):
-                some = slice(first, first + REFINED_ABREAST)
-                count = len(points[some])
-                y, slope = _linearised(
-                    problem,
-                    jnp.asarray(_filled(points[some], REFINED_ABREAST)),
-                    jnp.asarray(_filled(chosen[some], REFINED_ABREAST)),
-                )
-                outputs.append(np.asarray(y)[:count])
-                slopes.append(np.asarray(slope)[:, :count])
-        return np.concatenate(outputs), np.concatenate(slopes, axis=1)
+        individual, direction = np.nonzero(chosen >= 0)
+        columns = chosen[individual, direction]
+        moved = points[individual]
+        moved[np.arange(len(moved)), columns] += self.differences[columns]
+        every = self.simulated(np.concatenate([points, moved]))
+        outputs, changed = every[: len(points)], every[len(points) :]
+        slopes = np.zeros((chosen.shape[1], *outputs.shape))
+        slopes[direction, individual] = (changed - outputs[individual]) / self.differences[columns, None, None, None]
+        return outputs, slopes
 
 
 def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
@@ -152,7 +160,7 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
     names = [*problem.free, *problem.free_initial]
     column = {name: j for j, name in enumerate(names)}
     coordinates = problem.coordinates
-    nominal = np.zeros(len(names))
+    nominal, differences = np.zeros(len(names)), np.full(len(names), _DIFFERENCE)
     for c in found:
         for p in c.effect.parameters:
             j = column[c.parameter(p.name)]
@@ -160,13 +168,15 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
             unit = max((abs(t) for t in tried), default=1.0) or 1.0
             coordinates.lower[j], coordinates.upper[j] = 0.0, unit
             nominal[j] = (p.absent if p.absent is not None else (tried[0] if len(tried) else unit)) / unit
+            if p.absent is not None:
+                differences[j] = _DIFFERENCE_OF_SIZE
     values = {**fit.parameters, **initial}
     own = {column[c.parameter(p.name)] for c in found for p in c.effect.parameters}
     for name, j in column.items():
         if j not in own:
             one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
             nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
-    return Workbench(fit, full, problem, found, scales, internal, places, column, nominal)
+    return Workbench(fit, full, problem, found, scales, internal, places, column, nominal, differences)
 
 
 def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
@@ -212,15 +222,3 @@ def _disturbed(problem: Problem, point, added) -> Float[Array, "record time sign
 @jax.jit
 def _simulated(problem: Problem, points, added):
     return jax.vmap(functools.partial(_disturbed, problem))(points, added)
-
-
-@jax.jit
-def _linearised(problem: Problem, points, chosen):
-    every = jax.vmap(functools.partial(simulated, problem))
-    columns = jnp.arange(points.shape[1])
-
-    def along(column):
-        directions = (columns[None, :] == column[:, None]).astype(points.dtype)
-        return jax.jvp(every, (points,), (directions,))
-
-    return jax.vmap(along, out_axes=(None, 0))(chosen.T)
