@@ -32,6 +32,8 @@ EXACTLY_ALIKE = {
         "constant_force": "input_bias",
     },
 }
+# Sizes that are larger than plausible, but which plausible ones of other effects may look like.
+_IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -1e4}))
 # Of quantised noise, in deviations of the noise: nothing is hidden in a record whose readings are as coarse as that.
 COARSEST = 2.0
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
@@ -145,7 +147,7 @@ def nominal(model: str, seed: int, samples: int) -> Nominal:
 def library(model: str, seed: int, samples: int) -> dict[str, np.ndarray]:
     """Return what a plant could do instead of an effect that is hidden: by its name [variant, time], of unit length.
 
-    Each effect at small, medium and large sizes, outside what a refit could do.
+    Each effect at small, medium and large sizes, and a few implausible ones, outside what a refit could do.
     """
     command, period = excitation(model, seed)
     ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
@@ -155,6 +157,7 @@ def library(model: str, seed: int, samples: int) -> dict[str, np.ndarray]:
         for share, sign in ((0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (0.5, -1.0))
         if sign > 0 or name not in ONE_SIDED
     ]  # fmt: skip
+    variants += [(name, sizes) for name, sizes in _IMPLAUSIBLE if name in ranges]
     y = plant(
         model, [{name: sizes} for name, sizes in variants], np.tile(command[:samples], (len(variants), 1)), period
     )

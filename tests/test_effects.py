@@ -109,6 +109,20 @@ def test_every_effect_is_what_an_independent_plant_has(make, plant, period, comm
     assert off == {}
 
 
+@pytest.mark.parametrize("stiffness", [1e7, 1e8])
+def test_a_stop_is_right_to_a_hundredth_of_the_least_noise(stiffness):
+    end = 0.01
+    bounds = {"end_stop.positive_end": (0.0, 1.0), "end_stop.positive_stiffness": (1e6, 3e8)}
+    extended = attach(ehsvjax.servovalve(), bounds, duration=0.3, bank=BANK)
+    values = {"end_stop.positive_end": end, "end_stop.positive_stiffness": stiffness}
+    stopped = {"end_stop": {"position": end, "stiffness": stiffness}}
+    truth = servovalve_with([stopped], RECORD.inputs["command"][None], 1e-3, fine_step=2.5e-5)["position"][0]
+    position = ehsvjax.simulate(extended, RECORD, values)["position"]
+    assert position.max() > end
+    # Forces taken at the step's start instead of its middle are 20 times worse.
+    assert np.sqrt(np.mean((position - truth) ** 2)) < 1e-6
+
+
 def test_candidates_are_found_from_the_model():
     model = ehsvjax.van_der_pol()
     record = ehsvjax.Record(np.arange(50) * 0.02, {"command": np.ones(50)})

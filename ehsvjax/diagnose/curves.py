@@ -15,8 +15,8 @@ from ehsvjax.models.model import Model
 
 # Pieces of a curve in the tests; along an output, where a term may repeat over short distances, also this many, if
 # there are so many samples for each.
-_COARSE, _CLOSE = 8, 24
-_SAMPLES_PER_PIECE = 60
+_COARSE, _CLOSE = 8, 96
+_SAMPLES_PER_PIECE = 50
 _PROBE = 1e-3
 TIME = "time"
 

@@ -99,8 +99,7 @@ def _random_force(
     if selection.included:
         final = process_noise(bench, selection.final)
         assert final is not None
-        price = (_numbers(selection) - 1) * np.log(bench.problem.samples.measured.sum())
-        better = nominal.likelihood - final.of_sensor + price
+        better = nominal.likelihood - final.of_sensor + _least_price(selection)
         # A single cause that leaves nothing unexplained has the first word.
         single = innocent and len(selection.included) == 1
         if not better > (CONVINCING if single else 0.0):
@@ -121,16 +120,30 @@ def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[Miss
     term = missing_term(selection.bench, selection.nominal, white, selection.seen, before[:_SUSPECTS])
     r = white(selection.final.residual[0])
     price = float(np.log(len(r)))
-    causes = likelihood(float(r @ r), len(r), white) - _numbers(selection) * price
+    causes = likelihood(float(r @ r), len(r), white) - price * sum(_numbers(selection, i) for i in selection.included)
     as_well = term.likelihood + term.pieces * price > causes - INSEPARABLE
     return (term if as_well else None), term.likelihood > causes
 
 
-def _numbers(selection: Selection) -> int:
-    """Return the numbers of all causes for Bayes' price; a frequency counts for three, as a record fixes it so sharply.
+def _least_price(selection: Selection) -> float:
+    """Return Bayes' price for all causes but that of one number, each in the shape of its cheapest rival.
+
+    What a rival fits worse counts as part of its price: two numbers that explain as much as one are no better.
+    """
+    per_number = float(np.log(selection.bench.problem.samples.measured.sum()))
+    cheapest = [
+        min(float(r.refitted.cost[0] - selection.final.cost[0]) + per_number * _numbers(selection, r.candidate)
+            for r in group)
+        for group in selection.rivals
+    ]  # fmt: skip
+    return sum(cheapest) - per_number
+
+
+def _numbers(selection: Selection, candidate: int) -> int:
+    """Return the numbers of a cause for Bayes' price; a frequency counts for three, as a record fixes it so sharply.
 
     Its information grows with the third power of the record's length (Djuric 1996, "A model selection rule for
     sinusoids in white Gaussian noise").
     """
     bench = selection.bench
-    return sum(bench.numbers_of(i) + 2 * bench.candidates[i].effect.harmonic for i in selection.included)
+    return bench.numbers_of(candidate) + 2 * bench.candidates[candidate].effect.harmonic

@@ -22,11 +22,13 @@ from ehsvjax.diagnose.dependence import Dependence
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of, span, unexplained
 from ehsvjax.diagnose.significance import INSEPARABLE
-from ehsvjax.diagnose.smoothing import smoothed
+from ehsvjax.diagnose.smoothing import Smooth, smoothed
 from ehsvjax.diagnose.workbench import Workbench
 
 # For each knot of the smooth curve.
 _SAMPLES_PER_KNOT = 50
+# Curves that are drawn smooth, of which one is returned.
+_FINALISTS = 3
 # Steps of the estimate of a curve, dampings of each that are simulated, and what the last one gains at most.
 _STEPS = 8
 _DAMPINGS = (0.0, 1e-4, 1e-2, 0.3)
@@ -77,30 +79,31 @@ def missing_term(
 ) -> MissingTerm:
     """Estimate the term that takes most of what is left, at the place and along the quantity that explain most.
 
-    Each suspect is estimated, put into the simulation, and estimated again, for a large term is not linear: the one
-    that then leaves least, the price of its pieces paid, is it. Some make the same record by algebra (a load that
-    depends on the opening alone is a change of the opening): among those that explain alike, the one at whose place the
-    quantity is at home. What is returned has many pieces and is as smooth as the record says.
+    Each suspect is estimated, put into the simulation, and estimated again, for a large term is not linear. Those for
+    which there is most evidence are drawn with many pieces. Some make the same record by algebra (a load that depends
+    on the opening alone is a change of the opening): among those that explain alike, the one at whose place the
+    quantity is at home.
     """
     known, r = unexplained(final, white)
+    knots = len(r) // _SAMPLES_PER_KNOT
 
-    def attempted(place, quantity, pieces, start=None):
-        return _settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start)
+    def drawn(place, quantity, pieces, start=None):
+        settled = _settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start)
+        return _drawn(settled)
 
-    def with_price(attempt):
-        return attempt.left + len(attempt.coefficients) * np.log(len(r))
+    def drawn_finely(coarse):
+        start = coarse.settled
+        return min(coarse, drawn(*start.curve[:2], max(len(start.coefficients), knots), start), key=_cost)
 
-    attempts = [attempted(s.place, s.quantity, s.pieces) for s in suspects]
-    least = min(with_price(a) for a in attempts)
-    alike = [a for a in attempts if with_price(a) < least + INSEPARABLE]
-    first = min(alike, key=lambda a: (a.curve.place != a.curve.quantity, with_price(a)))
-    place, quantity = first.curve[:2]
-    knots = max(len(first.coefficients), len(r) // _SAMPLES_PER_KNOT)
-    finest = min(attempted(place, quantity, knots, first), first, key=lambda a: a.left)
-    curve, probe = finest.curve, probe_at(bench, place)
-    smooth = smoothed(curve.knots, finest.responses, finest.readings)
-    # What the unknowns took beside the curve stays taken.
-    left = finest.left + smooth.left - float(np.sum((finest.readings - finest.coefficients @ finest.responses) ** 2))
+    every = sorted((drawn(s.place, s.quantity, s.pieces) for s in suspects), key=_cost)
+    different = {d.settled.curve[:2]: d for d in reversed(every)}
+    finalists = [drawn_finely(d) for d in sorted(different.values(), key=_cost)[:_FINALISTS]]
+    alike = _alike(finalists)
+    best = min(alike, key=lambda d: (d.settled.curve.place != d.settled.curve.quantity, d.cost))
+    others = dict.fromkeys(d.settled.curve[:2] for d in (*alike, *_alike(every)))
+    curve, smooth, left = best.settled.curve, best.smooth, best.left
+    place, quantity = curve[:2]
+    probe = probe_at(bench, place)
     estimate, deviation = smooth.coefficients * probe, smooth.deviation * probe
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - left - smooth.pieces
@@ -117,7 +120,7 @@ def missing_term(
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
         pieces=smooth.pieces,
         likelihood=likelihood(left, len(r), white) - smooth.pieces * float(np.log(len(r))),
-        alike=tuple(dict.fromkeys(a.curve[:2] for a in alike if a.curve[:2] != (place, quantity))),
+        alike=tuple(other for other in others if other != (place, quantity)),
     )
 
 
@@ -126,7 +129,7 @@ def likelihood(left: float, count: int, white: Whitening) -> float:
     return -float(count * np.log(white.noises[0].innovation_variance * left / count)) - count
 
 
-class _Attempt(NamedTuple):
+class _Settled(NamedTuple):
     """A curve, where it has settled.
 
     Attributes:
@@ -147,7 +150,34 @@ class _Attempt(NamedTuple):
     responses: Float[np.ndarray, "piece sample"]
 
 
-def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, start: _Attempt | None) -> _Attempt:
+class _Drawn(NamedTuple):
+    """A settled curve, smooth: what it leaves, and that before it was drawn less the evidence for it."""
+
+    settled: _Settled
+    smooth: Smooth
+    left: float
+    cost: float
+
+
+def _drawn(settled: _Settled) -> _Drawn:
+    smooth = smoothed(settled.curve.knots, settled.responses, settled.readings)
+    # What the unknowns took beside the curve stays taken.
+    beside = settled.left - float(np.sum((settled.readings - settled.coefficients @ settled.responses) ** 2))
+    without = beside + float(settled.readings @ settled.readings)
+    return _Drawn(settled, smooth, beside + smooth.left, without - smooth.evidence)
+
+
+def _cost(drawn: _Drawn) -> float:
+    return drawn.cost
+
+
+def _alike(some: Sequence[_Drawn]) -> list[_Drawn]:
+    """Return those that explain a record as well as the best of them."""
+    least = min(d.cost for d in some)
+    return [d for d in some if d.cost < least + INSEPARABLE]
+
+
+def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, start: _Settled | None) -> _Settled:
     """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each.
 
     It starts where another curve at the same place has settled, or without any.
@@ -178,7 +208,7 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, st
             break
     known = span(rows[: len(columns)])
     responses = rows[len(columns) :] - (rows[len(columns) :] @ known) @ known.T
-    return _Attempt(curve, point, coefficients, left, r - known @ (known.T @ r) + coefficients @ responses, responses)
+    return _Settled(curve, point, coefficients, left, r - known @ (known.T @ r) + coefficients @ responses, responses)
 
 
 def _decomposed(rows):

@@ -15,13 +15,15 @@ _TOLD = 1e-8
 class Smooth(NamedTuple):
     """A smooth curve: its coefficients, their standard deviations, how many pieces it effectively has.
 
-    `left` is the sum of squares of the residual that it leaves.
+    `left` is the sum of squares of the residual that it leaves, `evidence` twice the logarithm of how much more
+    probable the readings are with some curve as smooth as this than without, in the same unit.
     """
 
     coefficients: Float[np.ndarray, " knot"]
     deviation: Float[np.ndarray, " knot"]
     pieces: float
     left: float
+    evidence: float
 
 
 def smoothed(
@@ -76,6 +78,7 @@ def smoothed(
         np.sqrt(root**2 @ kept),
         float(np.sum(kept)),
         float(np.sum((readings - coefficients @ responses) ** 2)),
+        -cost(best) * variance,
     )
 
 

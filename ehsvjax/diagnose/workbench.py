@@ -30,6 +30,8 @@ PLACES = ("force", "load", "opening", "supply", "damping", "displacement")
 _ABREAST = 16
 # Of coordinates, for derivatives. An effect's size may count so little in its own that rounding would drown it.
 _DIFFERENCE, _DIFFERENCE_OF_SIZE = 1e-6, 1e-4
+# Of the outputs: less is rounding.
+_ROUNDING = 3e-14
 TOLD_APART = 3e-5
 """Part of derivatives, relative to the largest, below which differences cannot tell them from zero."""
 
@@ -126,8 +128,12 @@ class Workbench:
         moved[np.arange(len(moved)), columns] += self.differences[columns]
         every = self.simulated(np.concatenate([points, moved]))
         outputs, changed = every[: len(points)], every[len(points) :]
+        change = changed - outputs[individual]
+        # What a dead zone hides has no derivative; rounding must not give it one.
+        largest = np.max(np.abs(outputs[individual]), axis=(1, 2, 3))
+        change[np.max(np.abs(change), axis=(1, 2, 3)) < _ROUNDING * largest] = 0.0
         slopes = np.zeros((chosen.shape[1], *outputs.shape))
-        slopes[direction, individual] = (changed - outputs[individual]) / self.differences[columns, None, None, None]
+        slopes[direction, individual] = change / self.differences[columns, None, None, None]
         return outputs, slopes
 
 

@@ -230,7 +230,8 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
             )
             flow = parameters["piston_area"] * state.velocity
             supply = signal("supply", parameters["supply_pressure"], flow=flow)
-            motion = {"position": state.position, "velocity": state.velocity}
+            # Forces act at their size in the middle of the step: of second order where they depend on the position.
+            motion = {"position": state.position + 0.5 * step_size * state.velocity, "velocity": state.velocity}
             force = signal("load_force", 0.0, **motion)
             friction = signal("load_friction", 0.0, **motion)
 

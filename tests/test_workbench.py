@@ -1,0 +1,59 @@
+"""The trials' workbench: what it simulates side by side, against JAX's own derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnose.refits import padded
+from ehsvjax.diagnose.workbench import workbench
+from ehsvjax.effects import BANK
+from ehsvjax.population import cast, simulated
+
+# One process compiles; records are as long as those of test_diagnose.py.
+pytestmark = pytest.mark.xdist_group("diagnoses of the oscillator")
+PERIOD, SAMPLES = 0.05, 600
+
+
+@pytest.fixture(scope="module")
+def bench():
+    model = ehsvjax.van_der_pol()
+    command = np.repeat(np.random.default_rng(6).uniform(-1.0, 1.0, 30), 20)
+    time = PERIOD * np.arange(SAMPLES)
+    position = ehsvjax.simulate(
+        model, ehsvjax.Record(time, {"command": command}), {"alpha": 0.96, "gamma": 1.23}
+    )["position"]  # fmt: skip
+    noisy = position + 0.01 * np.random.default_rng(7).standard_normal(SAMPLES)
+    record = ehsvjax.Record(time, {"command": command}, {"position": noisy})
+    fit = ehsvjax.identify(model, record, key=jax.random.key(0), population=50, generations=20)
+    return workbench(fit, record, BANK)
+
+
+def test_derivatives_are_those_of_jax_at_effects_present_and_absent(bench):
+    names = [c.name for c in bench.candidates]
+    present, absent = (names.index(n) for n in ("rayleigh_damping", "cubic_stiffness"))
+    columns = [*bench.columns_with([present, absent])]
+    point = bench.nominal.copy()
+    point[bench.columns_of(bench.candidates[present])] = 3.0
+    outputs, slopes = bench.linearised(point[None], padded([columns], len(columns) + 2))
+    with jax.enable_x64(True):
+        problem = cast(bench.problem, jnp.float64)
+        here = jnp.asarray(point)
+        along = jax.jit(lambda way: jax.jvp(lambda p: simulated(problem, p), (here,), (way,)))
+        expected = [along(jnp.eye(len(point))[j]) for j in columns]
+    np.testing.assert_allclose(outputs[0], expected[0][0], rtol=0, atol=1e-12)
+    for found, (_, slope) in zip(slopes[:, 0], expected, strict=False):
+        np.testing.assert_allclose(found, slope, rtol=0, atol=1e-3 * np.max(np.abs(slope)))
+    assert slopes.shape[0] == len(columns) + 2
+    assert not slopes[len(columns) :].any()
+
+
+def test_points_are_simulated_alike_alone_and_among_many(bench):
+    rng = np.random.default_rng(8)
+    points = np.repeat(bench.nominal[None], 37, axis=0)
+    points[:, bench.base_columns] *= rng.uniform(0.98, 1.02, (37, len(bench.base_columns)))
+    added = 1e-3 * rng.standard_normal((37, 1, SAMPLES, len(bench.places)))
+    together = bench.simulated(points, added)
+    for i in (0, 15, 16, 36):
+        np.testing.assert_array_equal(bench.simulated(points[i : i + 1], added[i : i + 1])[0], together[i])
