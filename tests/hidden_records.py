@@ -212,30 +212,40 @@ def records(hidden: Sequence[Hidden], samples: int | None = None) -> list[Made]:
 def left_by_refit(hidden: Hidden, made: Made) -> np.ndarray:
     """Return what a refit of the plant without any effect leaves of the position without noise, [time].
 
-    To first order for the servovalve. A refit of the oscillator moves its phase, which is far from linear: by
-    Levenberg-Marquardt.
+    To first order for the servovalve. A refit of the oscillator moves its phase, which is far from linear: by least
+    squares in the plant.
     """
     if hidden.model == "servovalve":
         return nominal(hidden.model, made.excitation, len(made.time)).outside(made.clean)
-    step, period = 1e-5, excitation(hidden.model, 0)[1]
+    return _left_by_oscillator(made, {})
+
+
+def _left_by_oscillator(made: Made, beside: Mapping[str, Mapping[str, float]]) -> np.ndarray:
+    """Return what the oscillator with these effects leaves of the position without noise, [time], all refitted."""
+    truth, period = TRUTH["van_der_pol"], excitation("van_der_pol", 0)[1]
+    numbers = [(name, number) for name, sizes in beside.items() for number in sizes]
+    sizes = [beside[name][number] for name, number in numbers]
+    start = np.array([truth["alpha"], truth["gamma"], 0.0, 0.0, *sizes])
+    lowest = [-np.inf] * 4 + [0.0 if name in ONE_SIDED else -np.inf for name, _ in numbers]
+    steps = np.array([1e-5] * 4 + [1e-4 * abs(size) for size in sizes])
 
     def positions(points):
+        effects = [{name: {} for name in beside} for _ in points]
+        for effect, point in zip(effects, points, strict=True):
+            for (name, number), value in zip(numbers, point[4:], strict=True):
+                effect[name][number] = value
         commands = np.tile(made.command, (len(points), 1))
-        alpha, gamma, initial = points[:, 0], points[:, 1], points[:, 2:]
-        return van_der_pol_with(
-            [{}] * len(points), commands, period, alpha, gamma, initial, fine_step=_REFIT_STEP
-        )["position"]  # fmt: skip
+        alpha, gamma, initial = points[:, 0], points[:, 1], points[:, 2:4]
+        return van_der_pol_with(effects, commands, period, alpha, gamma, initial, fine_step=_REFIT_STEP)["position"]
 
     def left(point):
         return made.clean - positions(point[None])[0]
 
     def slopes(point):
-        y = positions(point + step * np.eye(len(point) + 1, len(point), -1))
-        return -(y[1:] - y[0]).T / step
+        y = positions(np.concatenate([point[None], point + np.diag(steps)]))
+        return -((y[1:] - y[0]) / steps[:, None]).T
 
-    truth = TRUTH[hidden.model]
-    start = np.array([truth["alpha"], truth["gamma"], 0.0, 0.0])
-    return left(least_squares(left, start, slopes, method="lm", ftol=1e-4).x)
+    return left(least_squares(left, start, slopes, bounds=(lowest, np.inf), x_scale="jac", ftol=1e-4).x)
 
 
 def worth(hidden: Hidden, made: Made) -> float:
@@ -283,9 +293,18 @@ def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
 
 
 def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
-    """Return the noise variances that each of several effects is worth beside the others; None with random ones."""
+    """Return the noise variances that each of several effects is worth beside the others; None with random ones.
+
+    To first order for the servovalve, by least squares for the oscillator.
+    """
     if "process_noise" in hidden.names:
         return None
+    if hidden.model == "van_der_pol":
+        left = [
+            _left_by_oscillator(made, {n: sizes for n, sizes in made.sizes.items() if n != name})
+            for name in hidden.names
+        ]
+        return tuple(float(r @ r) / hidden.variance for r in left)
     without = nominal(hidden.model, made.excitation, len(made.time))
     alone = plant(
         hidden.model,
