@@ -41,7 +41,7 @@ def diagnose(
     """Say what a fitted model gets wrong on a record, name the cause, extend the model and measure the gain.
 
     Every effect of the bank is tried at every signal of the model that takes it; see `ehsvjax.effects` for how to add
-    one of yours. The first call for a model and a record's length compiles for some 20 s, further ones nothing.
+    one of yours. The first call for a model and a record's length compiles for some 10 s, further ones nothing.
 
     Args:
         fit: of the model, by `identify`.
