@@ -89,7 +89,7 @@ def missing_term(
 
     def drawn(place, quantity, pieces, start=None):
         settled = _settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start)
-        return _drawn(settled)
+        return _drawn(settled, float(r @ r))
 
     def drawn_finely(coarse):
         start = coarse.settled
@@ -151,7 +151,10 @@ class _Settled(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """A settled curve, smooth: what it leaves, and that before it was drawn less the evidence for it."""
+    """A settled curve, smooth: what it leaves, and what would be left without it less the evidence for it.
+
+    The latter is infinite for a curve that, drawn smooth, leaves more than none.
+    """
 
     settled: _Settled
     smooth: Smooth
@@ -159,12 +162,13 @@ class _Drawn(NamedTuple):
     cost: float
 
 
-def _drawn(settled: _Settled) -> _Drawn:
+def _drawn(settled: _Settled, whole: float) -> _Drawn:
     smooth = smoothed(settled.curve.knots, settled.responses, settled.readings)
     # What the unknowns took beside the curve stays taken.
     beside = settled.left - float(np.sum((settled.readings - settled.coefficients @ settled.responses) ** 2))
     without = beside + float(settled.readings @ settled.readings)
-    return _Drawn(settled, smooth, beside + smooth.left, without - smooth.evidence)
+    left = beside + smooth.left
+    return _Drawn(settled, smooth, left, without - smooth.evidence if left < whole else np.inf)
 
 
 def _cost(drawn: _Drawn) -> float:
@@ -174,7 +178,7 @@ def _cost(drawn: _Drawn) -> float:
 def _alike(some: Sequence[_Drawn]) -> list[_Drawn]:
     """Return those that explain a record as well as the best of them."""
     least = min(d.cost for d in some)
-    return [d for d in some if d.cost < least + INSEPARABLE]
+    return [d for d in some if d.cost <= least + INSEPARABLE]
 
 
 def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, start: _Settled | None) -> _Settled:
