@@ -33,7 +33,7 @@ def bench():
 def test_derivatives_are_those_of_jax_at_effects_present_and_absent(bench):
     names = [c.name for c in bench.candidates]
     present, absent = (names.index(n) for n in ("rayleigh_damping", "cubic_stiffness"))
-    columns = [*bench.columns_with([present, absent])]
+    columns = bench.columns_with([present, absent])
     point = bench.nominal.copy()
     point[bench.columns_of(bench.candidates[present])] = 3.0
     outputs, slopes = bench.linearised(point[None], padded([columns], len(columns) + 2))

@@ -146,9 +146,9 @@ def slopes_with(bench: Workbench, point, columns, coefficients, curve: Curve):
     points[1 + unknowns, columns] += bench.differences[columns]
     curves[1 + len(columns) :] += np.eye(len(coefficients))
     outputs = outputs_with(bench, points, curves, curve)
-    slopes = outputs[1:] - outputs[0]
-    slopes[: len(columns)] /= bench.differences[columns, None, None, None]
-    return slopes
+    by_unknowns, by_coefficients = np.split(outputs[1:], [len(columns)])
+    here = np.broadcast_to(outputs[0], by_unknowns.shape)
+    return np.concatenate([bench.derivatives(here, by_unknowns, columns), by_coefficients - outputs[0]])
 
 
 def quantity_unit(model: Model, name: str) -> str:

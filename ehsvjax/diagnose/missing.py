@@ -27,7 +27,7 @@ from ehsvjax.diagnose.workbench import Workbench
 
 # For each knot of the smooth curve.
 _SAMPLES_PER_KNOT = 50
-# Curves that are drawn smooth, of which one is returned.
+# Curves that are drawn with many pieces, of which one is returned.
 _FINALISTS = 3
 # Steps of the estimate of a curve, dampings of each that are simulated, and what the last one gains at most.
 _STEPS = 8
@@ -96,8 +96,10 @@ def missing_term(
         return min(coarse, drawn(*start.curve[:2], max(len(start.coefficients), knots), start), key=_cost)
 
     every = sorted((drawn(s.place, s.quantity, s.pieces) for s in suspects), key=_cost)
-    different = {d.settled.curve[:2]: d for d in reversed(every)}
-    finalists = [drawn_finely(d) for d in sorted(different.values(), key=_cost)[:_FINALISTS]]
+    different: dict[tuple[str, str], _Drawn] = {}
+    for d in every:
+        different.setdefault((d.settled.curve.place, d.settled.curve.quantity), d)
+    finalists = [drawn_finely(d) for d in list(different.values())[:_FINALISTS]]
     alike = _alike(finalists)
     best = min(alike, key=lambda d: (d.settled.curve.place != d.settled.curve.quantity, d.cost))
     others = dict.fromkeys(d.settled.curve[:2] for d in (*alike, *_alike(every)))

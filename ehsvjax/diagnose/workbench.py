@@ -94,6 +94,8 @@ class Workbench:
     ) -> Float[np.ndarray, "individual record time signal"]:
         """Return the outputs of each point, SI, with what is added to signals while they run."""
         shape = (*self.problem.samples.inputs.shape[:2], len(self.places))
+        with jax.enable_x64(True):
+            problem = cast(self.problem, jnp.float64)
 
         def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
             some = points[first : first + _ABREAST]
@@ -102,7 +104,6 @@ class Workbench:
                 added[: len(some)] = disturbances[first : first + _ABREAST]
             # The setting is that of a thread.
             with jax.enable_x64(True):
-                problem = cast(self.problem, jnp.float64)
                 filled = jnp.asarray(_filled(some, _ABREAST))
                 return np.asarray(_simulated(problem, filled, jnp.asarray(added)))[: len(some)]
 
@@ -128,13 +129,22 @@ class Workbench:
         moved[np.arange(len(moved)), columns] += self.differences[columns]
         every = self.simulated(np.concatenate([points, moved]))
         outputs, changed = every[: len(points)], every[len(points) :]
-        change = changed - outputs[individual]
-        # What a dead zone hides has no derivative; rounding must not give it one.
-        largest = np.max(np.abs(outputs[individual]), axis=(1, 2, 3))
-        change[np.max(np.abs(change), axis=(1, 2, 3)) < _ROUNDING * largest] = 0.0
         slopes = np.zeros((chosen.shape[1], *outputs.shape))
-        slopes[direction, individual] = change / self.differences[columns, None, None, None]
+        slopes[direction, individual] = self.derivatives(outputs[individual], changed, columns)
         return outputs, slopes
+
+    def derivatives(
+        self,
+        outputs: Float[np.ndarray, "direction record time signal"],
+        changed: Float[np.ndarray, "direction record time signal"],
+        columns: Int[np.ndarray, " direction"] | Sequence[int],
+    ) -> Float[np.ndarray, "direction record time signal"]:
+        """Return derivatives, from the outputs at points and at those moved by `differences` along columns."""
+        change = changed - outputs
+        # What a dead zone hides has no derivative; rounding must not give it one.
+        largest = np.max(np.abs(outputs), axis=(1, 2, 3))
+        change[np.max(np.abs(change), axis=(1, 2, 3)) < _ROUNDING * largest] = 0.0
+        return change / self.differences[columns, None, None, None]
 
 
 def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
