@@ -124,10 +124,11 @@ def test_an_effect_that_the_bank_lacks_is_unexplained():
 
 
 @of_the_servovalve
-def test_readings_coarser_than_the_noise_are_quantised():
+@pytest.mark.parametrize("deviations", [2.6, 6.0])
+def test_readings_coarser_than_the_noise_are_quantised(deviations):
     hidden = Hidden("servovalve", "white", 1e-9, (), 4)
     (made,) = records([hidden], SAMPLES["servovalve"])
-    step = 2e-4
+    step = deviations * hidden.variance**0.5
     record = ehsvjax.Record(made.time, {"command": made.command}, {"position": step * np.round(made.position / step)})
     fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=jax.random.key(0), population=50, generations=20)
     found = diagnose(fit, record, key=jax.random.key(0))

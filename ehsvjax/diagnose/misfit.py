@@ -115,7 +115,9 @@ def _in_frequency(residual, noise, period) -> Spectrum:
     from scipy.signal import welch
 
     length = min(len(residual), 1024)
-    frequency, power = welch(np.nan_to_num(residual), 1.0 / period, nperseg=length)
+    # A straight line across what is missing: a jump to zero and back would pass for noise at every frequency.
+    at, kept = np.arange(len(residual)), np.isfinite(residual)
+    frequency, power = welch(np.interp(at, at[kept], residual[kept]), 1.0 / period, nperseg=length)
     angle = np.exp(-2j * np.pi * frequency * period)
     response = 1.0 - sum(c * angle ** (k + 1) for k, c in enumerate(noise.coefficients))
     noise_power = 2.0 * period * noise.innovation_variance / np.abs(response) ** 2

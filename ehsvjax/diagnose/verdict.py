@@ -11,8 +11,8 @@ QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"
 # Share of what could be explained that must be, for causes to be named although something is left.
 _EXPLAINED = 0.9
-# Share of the noise's variance that a lattice of readings must make up to be a cause.
-_COARSE = 0.5
+# Of a lattice of readings to be a cause, in deviations of the other noise.
+_COARSEST = 2.2
 
 
 def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, ...], tuple[Alternative, ...]]:
@@ -39,7 +39,7 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
 def _quantised(misfit: Misfit) -> tuple[str, ...]:
     coarse = [
         name for name, m in misfit.outputs.items()
-        if m.lattice is not None and m.lattice**2 / 12.0 > _COARSE * m.noise_floor**2
+        if m.lattice is not None and m.lattice**2 > _COARSEST**2 * (m.noise_floor**2 - m.lattice**2 / 12.0)
     ]  # fmt: skip
     return tuple(QUANTISATION if len(misfit.outputs) == 1 else f"{QUANTISATION}@{name}" for name in coarse)
 

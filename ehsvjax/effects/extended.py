@@ -48,7 +48,9 @@ def extended(
         Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True),
     )  # fmt: skip
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
-    names = (*effects_of(model), *(c.name for c in attached))
+    # An end stop on either side is the same effect twice.
+    names = tuple(dict.fromkeys([*effects_of(model), *(c.name for c in attached)]))
+    others = (option for option in model.options if option[0] != "effects")
     return replace(
         model,
         signals=(*model.signals, *(Signal(disturbance(place), "input", "") for place in disturbed)),
@@ -58,7 +60,7 @@ def extended(
         stepper=equations.stepper,
         measure=equations.measure,
         prepare=equations.prepare,
-        options=(*model.options, ("effects", tuple(c.name for c in attached))),
+        options=(*others, ("effects", names)),
     )
 
 
