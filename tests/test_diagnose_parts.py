@@ -42,6 +42,15 @@ def test_readings_beside_gaps_are_no_spikes_and_spikes_are_found(share):
         assert set(np.flatnonzero(found[0, :, 0])) == set(at)
 
 
+@pytest.mark.parametrize("at", [0, 1, 2, 1997, 1998, 1999])
+def test_a_spike_at_an_end_of_a_record_is_found(at):
+    clean = series(np.sin(np.arange(2000) / 30.0))
+    readings = clean + np.random.default_rng(at).normal(0.0, 0.01, clean.shape)
+    readings[0, at, 0] -= 0.5
+    found = spikes(readings - clean, np.ones(readings.shape, bool), readings)
+    assert np.flatnonzero(found[0, :, 0]).tolist() == [at]
+
+
 def test_a_step_is_no_spike():
     readings = series(np.repeat([0.0, 1.0, 0.0], [50, 1, 50]) + np.repeat([0.0, 5.0], [70, 31]))
     readings += np.random.default_rng(1).normal(0.0, 0.01, readings.shape)

@@ -175,12 +175,16 @@ def spikes(
 
 
 def _alone(series: Float[np.ndarray, "record time"], apart: float) -> Bool[np.ndarray, "record time"]:
-    """Return samples that lie further than this on one side of all but one of the three before and the three after."""
+    """Return samples that lie further than this on one side of all but one of the three before and the three after.
+
+    At an end of the record, and beside what is missing, there are fewer.
+    """
     reach = 3
     filled = np.pad(series, ((0, 0), (reach, reach)), constant_values=np.nan)
     length = series.shape[1]
     neighbours = np.stack([filled[:, k : k + length] for k in range(2 * reach + 1) if k != reach])
-    return np.maximum(*(np.sum(side * (series - neighbours) > apart, axis=0) for side in (1, -1))) >= 2 * reach - 1
+    needed = np.maximum(np.sum(np.isfinite(neighbours), axis=0) - 1, 2)
+    return np.maximum(*(np.sum(side * (series - neighbours) > apart, axis=0) for side in (1, -1))) >= needed
 
 
 def lattice(values: Float[np.ndarray, " time"]) -> float | None:
