@@ -72,13 +72,14 @@ def _parts(name: str) -> tuple[str, str]:
 def _names_of(model: Model, watched: Equations) -> list[str]:
     """Return the names under which the watched equations report, by tracing them once."""
 
-    def outputs():
-        values = {p.name: 1.0 for p in model.parameters}
-        initial = {p.name: 0.0 for p in model.initial}
-        inputs = dict.fromkeys(model.inputs, 0.0)
+    def outputs(values, initial, inputs):
         return watched.measure(values, model.start(values, initial, inputs), inputs, identity)
 
-    return [name for name in jax.eval_shape(outputs) if name.startswith("along ")]
+    # Shapes only, no values: there is none that every parameter can have (an area, less all of it, divides by zero).
+    number = jnp.zeros(())
+    parameters, initial = (dict.fromkeys((p.name for p in own), number) for own in (model.parameters, model.initial))
+    traced = jax.eval_shape(outputs, parameters, initial, dict.fromkeys(model.inputs, number))
+    return [name for name in traced if name.startswith("along ")]
 
 
 @functools.cache
