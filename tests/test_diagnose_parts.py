@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import norm
 
+from ehsvjax.diagnose.curves import knots_along
 from ehsvjax.diagnose.gain import _gain
 from ehsvjax.diagnose.noise import lattice, noise_outside, plain_noise, spikes, whitening
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
@@ -20,6 +21,21 @@ def series(values):
 
 def two_sided(components):
     return 2.0 * norm.sf(np.abs(components[:, 0]))
+
+
+# --- Knots ---
+
+
+def test_knots_are_apart_where_a_motion_rests_but_for_rounding():
+    moving, resting = np.linspace(0.0, 1.0, 500), 1.0 + 1e-15 * np.arange(500)
+    knots = knots_along(np.concatenate([moving, resting]), 40)
+    assert knots[0] == 0.0 and knots[-1] == resting[-1]
+    assert np.diff(knots).min() > 1e-5 and len(knots) > 15
+
+
+def test_knots_of_held_levels_are_spread_over_their_range():
+    knots = knots_along(np.repeat([-1.0, 1.0], [900, 100]), 8)
+    np.testing.assert_allclose(knots, np.linspace(-1.0, 1.0, 8))
 
 
 # --- Spikes and lattices ---

@@ -17,6 +17,8 @@ from ehsvjax.models.model import Model
 # there are so many samples for each.
 _COARSE, _CLOSE = 8, 96
 _SAMPLES_PER_PIECE = 50
+# Of the range, between two knots: what rests is told apart by rounding alone.
+_LEAST_APART = 1e-4
 _PROBE = 1e-3
 TIME = "time"
 
@@ -77,13 +79,23 @@ def _curves(bench, place, seen, pieces) -> list[Curve]:
     relative = kinds[place] == "opening"
     found = []
     for name, series in seen.items():
-        knots = np.unique(np.quantile(series, np.linspace(0.0, 1.0, pieces)))
-        if len(knots) < 4:
-            # Held levels, of which most samples have the same: spread over the range.
-            knots = np.linspace(series.min(), series.max(), pieces)
+        knots = knots_along(series, pieces)
         hats = np.stack([np.interp(series, knots, np.eye(len(knots))[k]) for k in range(len(knots))])
         found.append(Curve(place, name, knots, hats, relative))
     return found
+
+
+def knots_along(series: Float[np.ndarray, " time"], pieces: int) -> Float[np.ndarray, " knot"]:
+    """Return ascending knots, at most so many, with as many samples between each two, over the range of a series."""
+    quantiles = np.quantile(series, np.linspace(0.0, 1.0, pieces))
+    knots = [quantiles[0]]
+    for value in quantiles[1:]:
+        if value - knots[-1] > _LEAST_APART * (quantiles[-1] - quantiles[0]):
+            knots.append(value)
+    if len(knots) < 4:
+        # Held levels, of which most samples have the same: spread over the range.
+        return np.linspace(quantiles[0], quantiles[-1], pieces)
+    return np.array([*knots[:-1], quantiles[-1]])
 
 
 def probe_at(bench: Workbench, place: str) -> float:
