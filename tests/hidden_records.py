@@ -37,7 +37,7 @@ _IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -
 # Of quantised noise, in deviations of the noise: nothing is hidden in a record whose readings are as coarse as that.
 COARSEST = 2.0
 # Pairs of effects that are refitted in the place of one that no bank has.
-_REFITTED = 3
+_PAIRS_REFITTED = 3
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
 # Sizes of these are never negative.
@@ -289,7 +289,7 @@ def oracle(hidden: Hidden, made: Made) -> Oracle:
     deficits = {names: size * (1.0 - rivals[names]) for names in best}
     if hidden.model == "van_der_pol" and name.startswith("unknown"):
         # Two effects that are to make up for a third may have to be large.
-        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in best[:_REFITTED]}
+        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in best[:_PAIRS_REFITTED]}
     rival = min(deficits, key=lambda names: deficits[names])
     return Oracle(size, deficits[rival], " and ".join(rival))
 

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax.diagnose.curves import knots_along
 from ehsvjax.diagnose.dependence import Dependence
 from ehsvjax.diagnose.examination import Examination
 from ehsvjax.diagnose.noise import lattice
@@ -125,11 +126,11 @@ def _in_frequency(residual, noise, period) -> Spectrum:
 
 
 def _against(residual, series, noise) -> Profile:
-    edges = np.unique(np.quantile(series, np.linspace(0.0, 1.0, _BINS + 1)))
-    which = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, max(len(edges) - 2, 0))
+    edges = knots_along(series, _BINS + 1)
+    which = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, len(edges) - 2)
     kept = np.isfinite(residual)
     middle, mean, deviation = [], [], []
-    for b in range(max(len(edges) - 1, 1)):
+    for b in range(len(edges) - 1):
         inside = kept & (which == b)
         count = int(inside.sum())
         if count:

@@ -88,8 +88,7 @@ def missing_term(
     knots = len(r) // _SAMPLES_PER_KNOT
 
     def drawn(place, quantity, pieces, start=None):
-        settled = _settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start)
-        return _drawn(settled, float(r @ r))
+        return _drawn(_settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start))
 
     def drawn_finely(coarse):
         start = coarse.settled
@@ -153,10 +152,7 @@ class _Settled(NamedTuple):
 
 
 class _Drawn(NamedTuple):
-    """A settled curve, smooth: what it leaves, and what would be left without it less the evidence for it.
-
-    The latter is infinite for a curve that, drawn smooth, leaves more than none.
-    """
+    """A settled curve, smooth: what it leaves, and what would be left without it less the evidence for it."""
 
     settled: _Settled
     smooth: Smooth
@@ -164,13 +160,12 @@ class _Drawn(NamedTuple):
     cost: float
 
 
-def _drawn(settled: _Settled, whole: float) -> _Drawn:
+def _drawn(settled: _Settled) -> _Drawn:
     smooth = smoothed(settled.curve.knots, settled.responses, settled.readings)
     # What the unknowns took beside the curve stays taken.
     beside = settled.left - float(np.sum((settled.readings - settled.coefficients @ settled.responses) ** 2))
     without = beside + float(settled.readings @ settled.readings)
-    left = beside + smooth.left
-    return _Drawn(settled, smooth, left, without - smooth.evidence if left < whole else np.inf)
+    return _Drawn(settled, smooth, beside + smooth.left, without - smooth.evidence)
 
 
 def _cost(drawn: _Drawn) -> float:

@@ -77,8 +77,9 @@ def _names_of(model: Model, watched: Equations) -> list[str]:
 
     # Shapes only, no values: there is none that every parameter can have (an area, less all of it, divides by zero).
     number = jnp.zeros(())
-    parameters, initial = (dict.fromkeys((p.name for p in own), number) for own in (model.parameters, model.initial))
-    traced = jax.eval_shape(outputs, parameters, initial, dict.fromkeys(model.inputs, number))
+    values = {p.name: number for p in model.parameters}
+    initial = {p.name: number for p in model.initial}
+    traced = jax.eval_shape(outputs, values, initial, dict.fromkeys(model.inputs, number))
     return [name for name in traced if name.startswith("along ")]
 
 
