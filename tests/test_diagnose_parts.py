@@ -10,6 +10,8 @@ from scipy.stats import norm
 from ehsvjax.diagnose.curves import knots_along
 from ehsvjax.diagnose.gain import _gain
 from ehsvjax.diagnose.noise import lattice, noise_outside, plain_noise, spikes, whitening
+from ehsvjax.diagnose.refits import Refits
+from ehsvjax.diagnose.rivals import Rival, inseparable
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 from ehsvjax.diagnose.suspects import _least_size
 from ehsvjax.precision.residual_noise import ResidualNoise
@@ -175,3 +177,41 @@ def test_a_misfit_in_one_place_leaves_the_interval_of_the_gain_finite():
     assert found.share_removed == pytest.approx(1.0, abs=0.05)
     low, high = found.share_interval
     assert 0.0 <= low <= found.share_removed <= high < 5.0
+
+
+# --- Rivals ---
+
+
+@pytest.mark.parametrize(
+    ("rival", "innocent", "gain", "kept"),
+    [
+        ("another slow wave", False, 1e4, True),
+        ("another slow wave", True, 1e4, False),  # where noise alone is left, 3^2 tells
+        ("another slow wave", False, 1e2, False),  # it lacks too much of what the cause gains
+        ("worse throughout", False, 1e4, False),
+        ("worse at one place by more than is left", False, 1e6, False),
+        ("as good", True, 1e4, True),
+    ],
+)
+def test_what_is_left_decides_which_rivals_a_record_tells_from_the_best(rival, innocent, gain, kept):
+    time = np.linspace(0.0, 1.0, 2000)
+    noise = np.random.default_rng(0).standard_normal(2000)
+    misfit = 0.0 if innocent else 0.8 * np.sin(9.0 * time)
+    change = {
+        "another slow wave": 0.3 * np.sin(31.0 * time + 1.0),
+        "worse throughout": 0.25 * np.random.default_rng(1).standard_normal(2000),
+        "worse at one place by more than is left": np.where(abs(time - 0.5) < 0.01, 9.0, 0.0),
+        "as good": 1e-3 * time,
+    }[rival]
+
+    def refitted(residual):
+        nothing = np.zeros((1, 0))
+        return Refits(nothing, np.sum(residual**2, keepdims=True), series(residual)[None], nothing, nothing, nothing)
+
+    best = refitted(noise + misfit)
+    other = refitted(noise + misfit + change)
+    deficit = float(other.cost[0] - best.cost[0])
+    assert (deficit > 9.0) == (rival != "as good")
+    white = plain_noise(np.ones(1), np.ones((1, 2000, 1), bool))
+    group = (Rival(0, 0.0, best), Rival(1, deficit, other))
+    assert len(inseparable(group, gain, white, innocent)) == 1 + kept

@@ -133,7 +133,7 @@ def _least_price(selection: Selection) -> float:
     per_number = float(np.log(selection.bench.problem.samples.measured.sum()))
     cheapest = [
         min(float(r.refitted.cost[0] - selection.final.cost[0]) + per_number * _numbers(selection, r.candidate)
-            for r in group)
+            for r in group if r.deficit < INSEPARABLE)
         for group in selection.rivals
     ]  # fmt: skip
     return sum(cheapest) - per_number

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits
+from ehsvjax.diagnose.refits import Refits, refit
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.trials import REFITTED_TOGETHER, Trials, fits, refit_screened, refit_sets, without
@@ -18,6 +18,11 @@ _SWAPS = 3
 _LOWER = 0.1
 # Deficit to first order of a rival that is refitted, however many there are; a large effect is not of first order.
 _WORTH_A_REFIT = 100.0
+# Deviations of the noise (root mean square) that a refit without an effect is off, beyond which it is too far off.
+_FAR = 5.0
+# Where a misfit is left: share of a cause's gain that a rival may lack, parts of the record that are compared, and
+# deviations between them.
+_LACKS, _PARTS, _SURELY = 0.1, 20, 3.0
 
 
 class Rival(NamedTuple):
@@ -26,6 +31,34 @@ class Rival(NamedTuple):
     candidate: int
     deficit: float
     refitted: Refits
+
+
+def inseparable(group: Sequence[Rival], gain: float, white: Whitening, innocent: bool) -> tuple[Rival, ...]:
+    """Return those rivals that a record cannot tell from the best: within `INSEPARABLE` if noise alone is left.
+
+    A misfit that none of them explains counts for one or the other by chance. What nearly gains as much as the best is
+    then only excluded by more than all that is left, or by more than what differs by chance between parts of the record
+    (Vuong 1989, "Likelihood ratio tests for model selection and non-nested hypotheses", with parts for samples, as what
+    is left is correlated).
+
+    Args:
+        group: all that was refitted in the place of one effect, the best first.
+        gain: of the best, in noise variances.
+        white: the noise of what is left.
+        innocent: whether that is noise alone.
+
+    """
+    best = white(group[0].refitted.residual[0]) ** 2
+    left = 0.0 if innocent else float(best.sum()) - len(best)
+
+    def excluded(rival: Rival) -> bool:
+        if rival.deficit < INSEPARABLE or rival.deficit > min(left, _LACKS * gain):
+            return rival.deficit >= INSEPARABLE
+        worse = white(rival.refitted.residual[0]) ** 2 - best
+        parts = [part.sum() for part in np.array_split(worse, _PARTS)]
+        return rival.deficit > _SURELY * float(np.sqrt(_PARTS) * np.std(parts, ddof=1))
+
+    return tuple(rival for rival in group if not excluded(rival))
 
 
 def rivals_of_all(
@@ -51,27 +84,42 @@ def rivals_of_all(
 
 
 def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, white: Whitening) -> tuple[Rival, ...]:
-    """Return what could be in the place of one effect, the best first: all within `INSEPARABLE` of the best."""
+    """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
-    current = refit_sets(trials, [without(bench, final.points[0], own)], [rest], white)
-    tried = responses_at(bench, current, rest, white, trials.parts)
-    screening = screen(bench, current, tried, white, 1)
-    close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, current)
-    rivals = [Rival(own, float(final.cost[0]) + PER_NUMBER * bench.numbers_of(own), final)]
-    for k, s in enumerate(close):
-        cost = float(refitted.cost[k]) + PER_NUMBER * bench.numbers_of(s.candidate)
-        if s.candidate == own:
-            if cost < rivals[0].deficit:
-                rivals[0] = Rival(own, cost, refitted.best(k))
-        elif np.isfinite(cost):
-            rivals.append(Rival(s.candidate, cost, refitted.best(k)))
+    start = without(bench, final.points[0], own)
+    current = refit_sets(trials, [start], [rest], white)
+    found = _refitted_from(trials, current, own, rest, white)
+    if current.cost[0] > _FAR**2 * white.used.sum():
+        # Refits from so far off end in local minima, and what is like the effect there need not be like it here.
+        beside = refit(bench, start[None], current.chosen, white, iterations=1)
+        for candidate, refitted in _refitted_from(trials, beside, own, rest, white, anew=True).items():
+            found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
+    rivals = [
+        Rival(candidate, _cost(refitted) + PER_NUMBER * bench.numbers_of(candidate), refitted)
+        for candidate, refitted in (found | {own: min(found.get(own, final), final, key=_cost)}).items()
+        if np.isfinite(_cost(refitted))
+    ]
     rivals.sort(key=lambda rival: rival.deficit)
     least = rivals[0].deficit
     if rivals[0].candidate != own and least > next(r.deficit for r in rivals if r.candidate == own) - 1e-3:
         # As good but for rounding: no reason to swap.
         rivals.sort(key=lambda rival: rival.candidate != own)
-    return tuple(r._replace(deficit=max(0.0, r.deficit - least)) for r in rivals if r.deficit - least < INSEPARABLE)
+    return tuple(r._replace(deficit=max(0.0, r.deficit - least)) for r in rivals)
+
+
+def _cost(refitted: Refits) -> float:
+    return float(refitted.cost[0])
+
+
+def _refitted_from(
+    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, anew: bool = False
+) -> dict[int, Refits]:
+    """Return the refits of candidates that are, at a point without the effect, most like it."""
+    bench = trials.bench
+    screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
+    close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
+    refitted = refit_screened(trials, close, rest, white, base, anew)
+    return {s.candidate: refitted.best(k) for k, s in enumerate(close)}
 
 
 def _close(ranked: Sequence[Screened], own: int) -> list[Screened]:

@@ -54,7 +54,7 @@ class Selection:
         nominal: the refit without any, under the same noise.
         white: the noise of what is left.
         stages: the looks, the first at the nominal model.
-        rivals: for each included effect those that could be there instead, itself first.
+        rivals: for each included effect all that were refitted in its place, the best, itself, first.
         gains: for each included effect how much worse the fit is without it, in noise variances.
 
     """

@@ -88,11 +88,21 @@ def refit_sets(
 
 
 def refit_screened(
-    trials: Trials, some: Sequence[Screened], rest: Sequence[int], white: Whitening, current: Refits
+    trials: Trials,
+    some: Sequence[Screened],
+    rest: Sequence[int],
+    white: Whitening,
+    current: Refits,
+    anew: bool = False,
 ) -> Refits:
-    """Refit each screened candidate beside the effects that are there already, from the refit without it."""
-    starts = _best_of(trials.bench, [_starts(trials.bench, s) for s in some], white, current)
-    return refit_sets(trials, list(starts), [(*rest, s.candidate) for s in some], white, race=True)
+    """Refit each screened candidate beside the effects that are there already, from a point without it.
+
+    From the start that promises most, or, where it must be looked for anew, from every start.
+    """
+    choices = [_starts(trials.bench, s) for s in some]
+    sets = [(*rest, s.candidate) for s in some]
+    starts = _best_led(trials.bench, choices, sets, white) if anew else _best_of(trials.bench, choices, white, current)
+    return refit_sets(trials, list(starts), sets, white, race=True)
 
 
 def refit_reshaped(
@@ -148,6 +158,16 @@ def _best_of(
     cost = np.where(np.isfinite(cost), cost, np.inf)
     edges = np.cumsum([0, *(len(choice) for choice in choices)])
     return np.stack([points[a + np.argmin(cost[a:b])] for a, b in itertools.pairwise(edges)])
+
+
+def _best_led(
+    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], sets: Sequence[Sequence[int]], white: Whitening
+) -> Float[np.ndarray, "individual parameter"]:
+    """Return of each list of points where the one has led whose refit with a set of effects fits best."""
+    of = np.repeat(np.arange(len(choices)), [len(choice) for choice in choices])
+    columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
+    led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], white)
+    return np.stack([led.points[np.argmin(np.where(of == i, led.cost, np.inf))] for i in range(len(choices))])
 
 
 def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " parameter"]]:

@@ -5,13 +5,15 @@ import numpy as np
 from ehsvjax.diagnose.diagnosis import Alternative
 from ehsvjax.diagnose.examination import Examination
 from ehsvjax.diagnose.misfit import Misfit
+from ehsvjax.diagnose.rivals import Rival, inseparable
+from ehsvjax.diagnose.selection import Selection
 from ehsvjax.diagnose.workbench import Workbench
 
 QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"
 # Share of what could be explained that must be, for causes to be named although something is left.
 _EXPLAINED = 0.9
-# Of a lattice of readings to be a cause, in deviations of the other noise.
+# Step of the readings' lattice, in deviations of the other noise, beyond which it is a cause.
 _COARSEST = 2.2
 
 
@@ -19,7 +21,7 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
     """Return the verdict, the causes and the alternatives."""
     selection = examined.selection
     groups = [
-        tuple(dict.fromkeys(selection.bench.candidates[r.candidate].name for r in selection.rivals[k]))
+        _names(selection, inseparable(selection.rivals[k], selection.gains[k], selection.white, examined.innocent))
         for k in np.argsort([-gain for gain in selection.gains])
     ]
     removed = float(selection.nominal.cost[0] - selection.final.cost[0])
@@ -34,6 +36,10 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
         groups[0] = (*groups[0], PROCESS_NOISE)
     alternatives = tuple(Alternative(g, _settled_by(selection.bench, g)) for g in groups if len(g) > 1)
     return ("ambiguous" if alternatives else "named"), causes, alternatives
+
+
+def _names(selection: Selection, group: tuple[Rival, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(selection.bench.candidates[r.candidate].name for r in group))
 
 
 def _quantised(misfit: Misfit) -> tuple[str, ...]:
