@@ -1,9 +1,11 @@
-"""From a fresh process to the first identified parameters: import, trace, compile, run; and again with JAX's cache.
+"""From a fresh process to the first identified parameters, or the first diagnosis: import, trace, compile, run.
 
     python benchmarks/cold_start.py [--repeats 3] [--out out/benchmarks]
 
 What is identified is a row of the paper's table 1: the Van der Pol oscillator, population 100, 50 generations, search
 and refinement. Every process is new; the second of each pair finds the first one's compiled programs in a cache folder.
+What is diagnosed is a servovalve, 5 s at 1 kHz, with the whole bank, identified in the same process: records of the
+plant of tests/hidden_plants.py with nothing hidden, one effect, and two.
 """
 
 import argparse
@@ -15,6 +17,11 @@ import tempfile
 from pathlib import Path
 
 import common
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.hidden_records import Hidden, records
 
 STAGES = ("import", "trace", "compile", "cache", "run", "total")
 
@@ -41,16 +48,23 @@ def listen(name, duration, **_):
 jax.monitoring.register_event_duration_secs_listener(listen)
 with np.load(sys.argv[1]) as data:
     record = ehsvjax.Record(data["time"], {"command": data["command"]}, {"position": data["position"]})
-before = time.perf_counter()
-fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=100, generations=50)
-done = time.perf_counter()
+fit = ehsvjax.identify(getattr(ehsvjax, sys.argv[2])(), record, key=jax.random.key(0), population=100, generations=50)
+if sys.argv[3] == "diagnose":
+    ehsvjax.diagnose(fit, record, key=jax.random.key(1))
 total = time.perf_counter() - began
 print(json.dumps({"import": imported - began, "spans": spans, "total": total}))
 """
 
 
-def one_process(data: Path, cache: Path | None) -> dict:
-    """Return the seconds of each stage of one fresh process."""
+HIDDEN = {
+    "diagnosis, nothing hidden": (),
+    "diagnosis, one effect": ("constant_load",),
+    "diagnosis, two effects": ("constant_load", "torque_motor_hysteresis"),
+}
+
+
+def one_process(data: Path, model: str, last: str, cache: Path | None = None) -> dict:
+    """Return the seconds of each stage of one fresh process, whose last step is to identify or to diagnose."""
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[1])}
     if cache is not None:
         # Programs of any compile time and size are stored: by default JAX keeps those that took over a second.
@@ -60,7 +74,11 @@ def one_process(data: Path, cache: Path | None) -> dict:
             "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         }
     printed = subprocess.run(
-        [sys.executable, "-c", PROCESS, str(data)], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", PROCESS, str(data), model, last],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
     ).stdout
     stages = json.loads(printed.splitlines()[-1])
     # Two programs are compiled beside each other, and while one is traced: each moment counts once, for the first of
@@ -88,20 +106,21 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
-    import numpy as np
-
-    case = common.cases()["van_der_pol"]
+    record = common.cases()["van_der_pol"].record
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         data = Path(folder) / "record.npz"
-        record = case.record
         np.savez(data, time=record.time, command=record.inputs["command"], position=record.outputs["position"])
         measured: dict[str, list[dict]] = {"without a cache": [], "cache, first": [], "cache, second": []}
         for repeat in range(options.repeats):
             cache = Path(folder) / f"cache_{repeat}"
-            measured["without a cache"].append(one_process(data, None))
-            measured["cache, first"].append(one_process(data, cache))
-            measured["cache, second"].append(one_process(data, cache))
+            measured["without a cache"].append(one_process(data, "van_der_pol", "identify"))
+            measured["cache, first"].append(one_process(data, "van_der_pol", "identify", cache))
+            measured["cache, second"].append(one_process(data, "van_der_pol", "identify", cache))
+        made = records([Hidden("servovalve", "white", 1e-7, names, seed=1) for names in HIDDEN.values()])
+        for name, one in zip(HIDDEN, made, strict=True):
+            np.savez(data, time=one.time, command=one.command, position=one.position)
+            measured[name] = [one_process(data, "servovalve", "diagnose") for _ in range(options.repeats)]
         for name, runs in measured.items():
             rows.append({"process": name} | {stage: statistics.median(r[stage] for r in runs) for stage in STAGES})
     common.report(rows, options.out, "cold_start", f"Seconds from a fresh process, medians of {options.repeats}")

@@ -225,6 +225,8 @@ def test_the_names_that_users_rely_on():
     assert van_der_pol().outputs == ("position",)
     assert van_der_pol().free == ("alpha", "gamma")
     assert [servovalve().unit(name) for name in ("position", "supply")] == ["m", "Pa"]
+    with pytest.raises(ValueError, match=r"expected a signal of servovalve, got 'pressure'; it has .*load_pressure"):
+        servovalve().unit("pressure")
 
 
 @every_model

@@ -1,9 +1,11 @@
 """A diagnosis as pictures: what is wrong, where it comes from, what is left of it, and the form of a missing term."""
 
+import textwrap
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ehsvjax.diagnose import words
 from ehsvjax.diagnose.curves import quantity_unit
 from ehsvjax.diagnose.diagnosis import Diagnosis
 from ehsvjax.plots import (
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 _SUSPECTS = 14
 _PANELS = 3
+# Characters in a line of the title.
+_TITLE_WIDTH = 110
 
 
 def plot_diagnosis(diagnosis: Diagnosis) -> "matplotlib.figure.Figure":
@@ -36,9 +40,9 @@ def plot_diagnosis(diagnosis: Diagnosis) -> "matplotlib.figure.Figure":
     missing = diagnosis.missing is not None
     with _style():
         figure = _figure(width=10.0, height=4.6 * len(names) + 3.4)
-        causes = " and ".join(_words(cause) for cause in diagnosis.causes)
-        said = f"{diagnosis.verdict}{': ' if causes else ''}{causes}"
-        figure.suptitle(f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {said}")
+        said = ": ".join(part for part in (diagnosis.verdict, _words(words.causes(diagnosis))) if part)
+        title = f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {said}"
+        figure.suptitle(textwrap.fill(title, _TITLE_WIDTH))
         parts = figure.subfigures(len(names) + 1, 1, height_ratios=[4.6] * len(names) + [3.4], squeeze=False)[:, 0]
         for part, name in zip(parts, names, strict=False):
             _draw_output(part, diagnosis, name)

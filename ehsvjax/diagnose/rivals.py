@@ -52,8 +52,10 @@ def inseparable(group: Sequence[Rival], gain: float, white: Whitening, innocent:
     left = 0.0 if innocent else float(best.sum()) - len(best)
 
     def excluded(rival: Rival) -> bool:
-        if rival.deficit < INSEPARABLE or rival.deficit > min(left, _LACKS * gain):
-            return rival.deficit >= INSEPARABLE
+        if rival.deficit < INSEPARABLE:
+            return False
+        if rival.deficit > min(left, _LACKS * gain):
+            return True
         worse = white(rival.refitted.residual[0]) ** 2 - best
         parts = [part.sum() for part in np.array_split(worse, _PARTS)]
         return rival.deficit > _SURELY * float(np.sqrt(_PARTS) * np.std(parts, ddof=1))

@@ -21,19 +21,21 @@ def sentences(diagnosis: "Diagnosis") -> list[str]:
 
 def verdict(diagnosis: "Diagnosis") -> str:
     """Return the verdict in a sentence."""
-    causes = " and ".join(diagnosis.causes)
     left = "" if diagnosis.innocent else " Something is left that no candidate explains."
     if diagnosis.verdict == "adequate":
         return "adequate. What the model leaves is noise: it depends on nothing that runs along the model."
     if diagnosis.verdict == "named":
-        return f"{causes}.{left}"
+        return f"{causes(diagnosis)}.{left}"
     if diagnosis.verdict == "ambiguous":
-        said = [
-            f"{a.causes[0]} or {' or '.join(a.causes[1:])}" for a in diagnosis.alternatives
-        ]  # fmt: skip
-        alone = [c for c in diagnosis.causes if all(c not in a.causes for a in diagnosis.alternatives)]
-        return "ambiguous: " + "; and ".join([*alone, *said]) + f": this record cannot tell.{left}"
+        return f"ambiguous: {causes(diagnosis)}: this record cannot tell.{left}"
     return "unexplained. Something is missing, and no effect of the bank leaves an innocent residual."
+
+
+def causes(diagnosis: "Diagnosis") -> str:
+    """Return the causes in words, each with what it cannot be told from; none if nothing is named."""
+    groups = [" or ".join(a.causes) for a in diagnosis.alternatives]
+    alone = [c for c in diagnosis.causes if all(c not in a.causes for a in diagnosis.alternatives)]
+    return ("; and " if groups else " and ").join([*alone, *groups])
 
 
 def misfit_lines(diagnosis: "Diagnosis") -> list[str]:

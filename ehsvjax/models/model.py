@@ -158,8 +158,16 @@ class Model:
         raise ValueError(f"expected a parameter of {self.name}, got {name!r}; it has {known}")
 
     def unit(self, signal: str) -> str:
-        """Unit of the signal of that name."""
-        return next(s.unit for s in self.signals if s.name == signal)
+        """Return the unit of the signal of that name.
+
+        Raises:
+            ValueError: if the model has none of that name; lists those that it has.
+
+        """
+        units = {s.name: s.unit for s in self.signals}
+        if signal not in units:
+            raise ValueError(f"expected a signal of {self.name}, got {signal!r}; it has {', '.join(units)}")
+        return units[signal]
 
     def with_bounds(
         self,
