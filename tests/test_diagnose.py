@@ -12,6 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ehsvjax
+from ehsvjax.diagnose import Alternative
 from ehsvjax.effects import BANK, amplitude, attach, effects_of
 from tests.compilations import compilations
 
@@ -247,6 +248,15 @@ def test_what_is_printed_has_no_gap_where_a_unit_is_none(diagnosis):
     assert re.findall(r"\S+ [,;.)]|\S  \S+", str(diagnosis)) == []
 
 
+def test_causes_that_cannot_be_told_apart_are_told_as_such(diagnosis):
+    either = Alternative(("sensor_bias", "input_bias"), "")
+    causes = ("sensor_bias", "sensor_lag")
+    unsure = dataclasses.replace(diagnosis, verdict="ambiguous", causes=causes, alternatives=(either,))
+    assert "ambiguous: sensor_lag; and sensor_bias or input_bias: this record cannot tell." in str(unsure)
+    title = " ".join(unsure.plot().get_suptitle().split())
+    assert title.endswith(": ambiguous: sensor lag; and sensor bias or input bias")
+
+
 def test_what_was_not_there_is_excluded_or_said_to_be_unseen(diagnosis):
     excluded = {e.cause: e.above for e in diagnosis.excluded}
     assert "sensor_bias" not in excluded and "sensor_bias" not in diagnosis.unseen
@@ -265,13 +275,14 @@ def test_the_page_needs_no_other_file_and_takes_no_name_for_markup(diagnosis, tm
     assert "bench &lt;script&gt;alert(1)&lt;/script&gt;" in page
     for cause in diagnosis.table["cause"]:
         assert f"<td>{cause}</td>" in page, cause
-    assert "<b>named</b>: sensor_bias" in page
+    assert '<p class="verdict">sensor_bias.' in page
     for tag in ("html", "head", "body", "table", "tr", "td", "ul", "li", "pre", "p"):
         assert len(re.findall(rf"<{tag}[ >]", page)) == page.count(f"</{tag}>"), tag
 
 
 def test_every_axis_of_the_picture_says_what_it_shows(diagnosis):
     figure = diagnosis.plot()
+    assert figure.get_suptitle().endswith(": named: sensor bias")
     assert len(figure.axes) == 6
     assert "suspects" in [axes.get_title(loc="left") for axes in figure.axes]
     labels = [axes.get_xlabel() for axes in figure.axes]
