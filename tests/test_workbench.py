@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 import ehsvjax
+from ehsvjax.diagnose.noise import plain_noise
 from ehsvjax.diagnose.refits import padded
+from ehsvjax.diagnose.screening import Screened
+from ehsvjax.diagnose.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnose.workbench import workbench
 from ehsvjax.effects import BANK
 from ehsvjax.population import cast, simulated
@@ -16,18 +19,22 @@ pytestmark = pytest.mark.xdist_group("diagnoses of the oscillator")
 PERIOD, SAMPLES = 0.05, 600
 
 
-@pytest.fixture(scope="module")
-def bench():
+def bench_of(limit: float):
+    """Return the workbench of a record in whose plant the command ends at a limit."""
     model = ehsvjax.van_der_pol()
     command = np.repeat(np.random.default_rng(6).uniform(-1.0, 1.0, 30), 20)
     time = PERIOD * np.arange(SAMPLES)
-    position = ehsvjax.simulate(
-        model, ehsvjax.Record(time, {"command": command}), {"alpha": 0.96, "gamma": 1.23}
-    )["position"]  # fmt: skip
+    acting = ehsvjax.Record(time, {"command": np.clip(command, -limit, limit)})
+    position = ehsvjax.simulate(model, acting, {"alpha": 0.96, "gamma": 1.23})["position"]
     noisy = position + 0.01 * np.random.default_rng(7).standard_normal(SAMPLES)
     record = ehsvjax.Record(time, {"command": command}, {"position": noisy})
     fit = ehsvjax.identify(model, record, key=jax.random.key(0), population=50, generations=20)
     return workbench(fit, record, BANK)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    return bench_of(np.inf)
 
 
 def test_derivatives_are_those_of_jax_at_effects_present_and_absent(bench):
@@ -57,3 +64,23 @@ def test_points_are_simulated_alike_alone_and_among_many(bench):
     together = bench.simulated(points, added)
     for i in (0, 15, 16, 36):
         np.testing.assert_array_equal(bench.simulated(points[i : i + 1], added[i : i + 1])[0], together[i])
+
+
+def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
+    bench = bench_of(0.7)
+    names = [c.name for c in bench.candidates]
+    limit, rival = names.index("input_saturation"), names.index("input_gain")
+    trials = trials_of(bench, lambda stage: None)
+    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    without = refit_sets(trials, [bench.nominal], [()], white)
+    (column,) = bench.columns_of(bench.candidates[limit])
+    unit = bench.problem.coordinates.upper[column]
+    start = without.points[0].copy()
+    start[column] = 0.999 * np.max(np.abs(bench.problem.samples.inputs)) / unit
+    some = [
+        Screened(i, 5.0, 1e-6, 1e-4, p, np.zeros(SAMPLES), (), False, 0.0)
+        for i, p in ((limit, start), (rival, without.points[0]))
+    ]
+    found = refit_screened(trials, some, (), white, without)
+    assert found.points[0, column] * unit == pytest.approx(0.7, rel=0.02)
+    assert found.cost[0] < 1.2 * SAMPLES < found.cost[1] < without.cost[0]

@@ -173,9 +173,11 @@ def _best_led(
 def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " parameter"]]:
     """Return the start of a candidate, and starts with more or less of the effect, which may be far from linear."""
     candidate = bench.candidates[screened.candidate]
-    amplitudes = [n for n in candidate.effect.parameters if n.absent is not None and n.absent != UNLIMITED]
+    amplitudes = [n for n in candidate.effect.parameters if n.absent is not None]
     columns = [bench.column[candidate.parameter(n.name)] for n in amplitudes]
-    absent = np.array([n.absent for n in amplitudes]) / bench.problem.coordinates.upper[columns]
+    # Shares of a limit are shares of itself: where it hardly acts yet, no derivative tells how low it is.
+    nothing = np.array([0.0 if n.absent == UNLIMITED else n.absent for n in amplitudes])
+    absent = nothing / bench.problem.coordinates.upper[columns]
     lower, upper = bounds_of(bench)
     starts = [screened.start]
     for share in _SHARES if columns else ():
