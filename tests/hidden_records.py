@@ -22,9 +22,15 @@ TRUTH = {
     "van_der_pol": {"alpha": 0.96, "gamma": 1.23},
 }
 # Another effect that makes the same record with other parameters, whatever its size: gamma*(1 - x^2/c^2) - d is
-# g*(1 - x^2/k^2) with g = gamma - d; a stiffer spring is a smaller input; an input's bias is a constant force.
+# g*(1 - x^2/k^2) with g = gamma - d; a stiffer spring is a smaller input; an input's bias is a constant force. What a
+# pump's resistance takes from the supply at a flow A*v, a viscous friction of A^2 times that takes from the load.
 EXACTLY_ALIKE = {
-    "servovalve": {"null_bias": "asymmetric_dead_zone", "asymmetric_dead_zone": "null_bias"},
+    "servovalve": {
+        "null_bias": "asymmetric_dead_zone",
+        "asymmetric_dead_zone": "null_bias",
+        "supply_droop": "viscous_friction",
+        "viscous_friction": "supply_droop",
+    },
     "van_der_pol": {
         "linear_damping": "damping_threshold",
         "damping_threshold": "linear_damping",
