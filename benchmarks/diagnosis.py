@@ -5,9 +5,9 @@
 
 The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
 kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an
-effect that the bank does not have. For one effect the plant also says what could be known: the noise variances by which
-the best rival would fit worse, to first order, the nominal parameters refitted. Draws are shared out to processes, one
-on each core; each trial can be repeated from its seed.
+effect that the bank does not have. Of effects the plant also says what could be known: the noise variances by which the
+best rival would fit worse, to first order, the nominal parameters refitted. Draws are shared out to processes, one on
+each core; each trial can be repeated from its seed.
 """
 
 import argparse
@@ -85,7 +85,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         record = ehsvjax.Record(one.time, {"command": one.command}, {"position": one.position})
         hidden = trial.hidden
         row: dict[str, Any] = {"kind": trial.kind, **hidden._asdict(), "sizes": one.sizes}
-        if trial.kind in ("one", "unknown") and hidden.names != ("process_noise",):
+        if trial.kind != "none" and "process_noise" not in hidden.names:
             known = oracle(hidden, one)
             row |= {"worth": known.worth, "rival_deficit": known.deficit, "rival": known.rival}
         if trial.kind == "two":
@@ -193,8 +193,10 @@ def summary(table: pd.DataFrame) -> list[str]:
         if len(some):
             lines.append(f"{kind}: {counts(some)}")
             if kind == "two":
-                seen = some[[worths is not None and min(worths) > SEPARABLE for worths in some["worth_each"]]]
-                lines.append(f"    both worth more than {SEPARABLE:g} beside the other: {counts(seen)}")
+                each = np.array([worths is not None and min(worths) > SEPARABLE for worths in some["worth_each"]])
+                seen = some[each & (some["rival_deficit"] > SEPARABLE)]
+                lines.append(f"    both worth more than {SEPARABLE:g} beside the other, and any one effect worse by as "
+                             f"much: {counts(seen)}")  # fmt: skip
             if kind == "unknown":
                 clear = some[some["rival_deficit"] > SEPARABLE]
                 lines.append(f"    best two of the bank worse by more than {SEPARABLE:g}: {counts(clear)}")

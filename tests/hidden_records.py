@@ -42,8 +42,8 @@ EXACTLY_ALIKE = {
 _IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -1e4}))
 # Of quantised noise, in deviations of the noise: nothing is hidden in a record whose readings are as coarse as that.
 COARSEST = 2.0
-# Pairs of effects that are refitted in the place of one that no bank has.
-_PAIRS_REFITTED = 3
+# Rivals that are refitted in the place of two effects, or of one that no bank has.
+_RIVALS_REFITTED = 3
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
 # Sizes of these are never negative.
@@ -262,13 +262,13 @@ def worth(hidden: Hidden, made: Made) -> float:
 
 
 class Oracle(NamedTuple):
-    """What could be known of one hidden effect, in noise variances.
+    """What could be known of what is hidden, in noise variances.
 
     Attributes:
         worth: of it beside a refit of what is known.
-        deficit: by which the best rival is worse, to first order but where two of the oscillator's stand for one that
-            is in no bank; 0 for a rival that makes the same record.
-        rival: that rival; for an effect that is in no bank also two together.
+        deficit: by which the best rival is worse, to first order but where some of the oscillator's stand for what
+            else they are not; 0 for a rival that makes the same record.
+        rival: that rival: one other effect, for two effects together any one; for an effect that is in no bank two.
 
     """
 
@@ -278,26 +278,32 @@ class Oracle(NamedTuple):
 
 
 def oracle(hidden: Hidden, made: Made) -> Oracle:
-    """Return what could be known of the one effect that a record hides."""
+    """Return what could be known of the effects that a record hides: one or two, or one that is in no bank."""
     left = left_by_refit(hidden, made)
     size = float(left @ left) / hidden.variance
     unit = left / max(np.linalg.norm(left), 1e-300)
-    (name,) = hidden.names
-    if name == "sensor_quantisation" and made.sizes[name]["step"] < COARSEST * hidden.variance**0.5:
+    unknown = hidden.names[0].startswith("unknown")
+    if len(hidden.names) == 1 and _is_noise(hidden.names[0], hidden, made):
         return Oracle(size, 0.0, "quantised noise")
-    if name in EXACTLY_ALIKE[hidden.model]:
-        return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][name])
+    if len(hidden.names) == 1 and hidden.names[0] in EXACTLY_ALIKE[hidden.model]:
+        return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][hidden.names[0]])
     every = library(hidden.model, made.excitation, len(made.time))
-    rivals = {(other,): float(np.max((every[other] @ unit) ** 2)) for other in every if other != name}
-    if name.startswith("unknown"):
+    if unknown:
         rivals = {pair: _share_of(unit, *(every[other] for other in pair)) for pair in combinations(every, 2)}
+    else:
+        rivals = {(other,): float(np.max((every[other] @ unit) ** 2)) for other in every if hidden.names != (other,)}
     best = sorted(rivals, key=lambda names: -rivals[names])
     deficits = {names: size * (1.0 - rivals[names]) for names in best}
-    if hidden.model == "van_der_pol" and name.startswith("unknown"):
-        # Two effects that are to make up for a third may have to be large.
-        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in best[:_PAIRS_REFITTED]}
+    if hidden.model == "van_der_pol" and (unknown or len(hidden.names) > 1):
+        # What is to make up for something else may have to be large.
+        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in best[:_RIVALS_REFITTED]}
     rival = min(deficits, key=lambda names: deficits[names])
     return Oracle(size, deficits[rival], " and ".join(rival))
+
+
+def _is_noise(name: str, hidden: Hidden, made: Made) -> bool:
+    """Whether an effect is a lattice of readings as fine as that of quantised noise."""
+    return name == "sensor_quantisation" and made.sizes[name]["step"] < COARSEST * hidden.variance**0.5
 
 
 def _refitted(hidden: Hidden, made: Made, names: Sequence[str]) -> float:
@@ -317,7 +323,7 @@ def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
 def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
     """Return the noise variances that each of several effects is worth beside the others; None with random ones.
 
-    To first order for the servovalve, by least squares for the oscillator.
+    To first order for the servovalve, by least squares for the oscillator; none for what is but noise.
     """
     if "process_noise" in hidden.names:
         return None
@@ -340,7 +346,7 @@ def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
         others = np.concatenate([without.basis, np.delete(changes, i, axis=0).T], axis=1)
         q = np.linalg.qr(others)[0]
         left = changes[i] - q @ (q.T @ changes[i])
-        worths.append(float(left @ left) / hidden.variance)
+        worths.append(0.0 if _is_noise(hidden.names[i], hidden, made) else float(left @ left) / hidden.variance)
     return tuple(worths)
 
 
