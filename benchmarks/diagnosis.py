@@ -6,8 +6,8 @@
 The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
 kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an
 effect that the bank does not have. Of effects the plant also says what could be known: the noise variances by which the
-best rival would fit worse, to first order, the nominal parameters refitted. Draws are shared out to processes, one on
-each core; each trial can be repeated from its seed.
+best rival would fit worse, the nominal parameters refitted, to first order for the servovalve. Draws are shared out to
+processes, one on each core; each trial can be repeated from its seed.
 """
 
 import argparse

@@ -42,8 +42,9 @@ EXACTLY_ALIKE = {
 _IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -1e4}))
 # Of quantised noise, in deviations of the noise: nothing is hidden in a record whose readings are as coarse as that.
 COARSEST = 2.0
-# Rivals that are refitted in the place of two effects, or of one that no bank has.
+# Rivals of the oscillator's that are refitted in the place of what is hidden.
 _RIVALS_REFITTED = 3
+_HARMONIC = ("harmonic_force", "parametric_excitation")
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
 # Sizes of these are never negative.
@@ -253,7 +254,10 @@ def _left_by_oscillator(made: Made, beside: Mapping[str, Mapping[str, float]]) -
         y = positions(np.concatenate([point[None], point + np.diag(steps)]))
         return -((y[1:] - y[0]) / steps[:, None]).T
 
-    return left(least_squares(left, start, slopes, bounds=(lowest, np.inf), x_scale="jac", ftol=1e-4).x)
+    # A step too far overflows; the next is shorter.
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = least_squares(left, start, slopes, bounds=(lowest, np.inf), x_scale="jac", ftol=1e-4, max_nfev=50)
+    return found.fun
 
 
 def worth(hidden: Hidden, made: Made) -> float:
@@ -266,8 +270,8 @@ class Oracle(NamedTuple):
 
     Attributes:
         worth: of it beside a refit of what is known.
-        deficit: by which the best rival is worse, to first order but where some of the oscillator's stand for what
-            else they are not; 0 for a rival that makes the same record.
+        deficit: by which the best rival is worse, to first order for the servovalve; 0 for a rival that makes the
+            same record.
         rival: that rival: one other effect, for two effects together any one; for an effect that is in no bank two.
 
     """
@@ -294,9 +298,10 @@ def oracle(hidden: Hidden, made: Made) -> Oracle:
         rivals = {(other,): float(np.max((every[other] @ unit) ** 2)) for other in every if hidden.names != (other,)}
     best = sorted(rivals, key=lambda names: -rivals[names])
     deficits = {names: size * (1.0 - rivals[names]) for names in best}
-    if hidden.model == "van_der_pol" and (unknown or len(hidden.names) > 1):
-        # What is to make up for something else may have to be large.
-        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in best[:_RIVALS_REFITTED]}
+    if hidden.model == "van_der_pol":
+        # What is to make up for something else may have to be large, or of a frequency that the library lacks.
+        tried = dict.fromkeys([*best[:_RIVALS_REFITTED], *((name,) for name in _HARMONIC if (name,) in deficits)])
+        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in tried}
     rival = min(deficits, key=lambda names: deficits[names])
     return Oracle(size, deficits[rival], " and ".join(rival))
 
