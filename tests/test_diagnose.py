@@ -275,7 +275,7 @@ def test_the_page_needs_no_other_file_and_takes_no_name_for_markup(diagnosis, tm
     assert "bench &lt;script&gt;alert(1)&lt;/script&gt;" in page
     for cause in diagnosis.table["cause"]:
         assert f"<td>{cause}</td>" in page, cause
-    assert '<p class="verdict">sensor_bias.' in page
+    assert "<b>named</b>: sensor_bias" in page
     for tag in ("html", "head", "body", "table", "tr", "td", "ul", "li", "pre", "p"):
         assert len(re.findall(rf"<{tag}[ >]", page)) == page.count(f"</{tag}>"), tag
 
