@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
-from ehsvjax.diagnose.curves import knots_along
+from ehsvjax.diagnose.curves import _all_waves, knots_along, single_waves
+from ehsvjax.diagnose.dependence import _log_of_chi_square
 from ehsvjax.diagnose.gain import _gain
 from ehsvjax.diagnose.noise import lattice, noise_outside, plain_noise, spikes, whitening
 from ehsvjax.diagnose.refits import Refits
@@ -177,6 +178,31 @@ def test_a_misfit_in_one_place_leaves_the_interval_of_the_gain_finite():
     assert found.share_removed == pytest.approx(1.0, abs=0.05)
     low, high = found.share_interval
     assert 0.0 <= low <= found.share_removed <= high < 5.0
+
+
+# --- Terms that repeat ---
+
+
+@given(waves=st.integers(3, 24))
+@settings(max_examples=10, deadline=None)
+def test_single_waves_are_sums_of_all_waves(waves):
+    # Also between the knots from which they were computed.
+    share = np.random.default_rng(waves).uniform(0.0, 1.0, 500)
+    alone = single_waves(waves) @ _all_waves(share, waves)
+    numbers = np.arange(2.25, waves + 0.1, 0.25)
+    assert alone.shape == (len(numbers), 2, 500)
+    angles = 2.0 * np.pi * numbers[:, None] * share
+    assert np.max(np.abs(alone - np.stack([np.cos(angles), np.sin(angles)], axis=1))) < 0.01
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 60, 97])
+def test_the_logarithm_of_a_p_value_goes_on_where_the_p_value_is_zero(freedom):
+    assert _log_of_chi_square(30.0, freedom) == pytest.approx(chi2.logsf(30.0, freedom))
+    near, far = 1200.0, 2000.0
+    assert chi2.sf(far, freedom) == 0.0
+    # From where it is not zero yet, along the density's logarithm.
+    step = 0.5 * (near - far) + (0.5 * freedom - 1.0) * np.log(far / near)
+    assert _log_of_chi_square(far, freedom) == pytest.approx(chi2.logsf(near, freedom) + step, abs=0.2)
 
 
 # --- Rivals ---

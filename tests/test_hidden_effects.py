@@ -124,6 +124,18 @@ def test_an_effect_that_the_bank_lacks_is_unexplained():
 
 
 @of_the_servovalve
+def test_a_weak_term_that_repeats_along_the_stroke_is_seen_with_its_pitch():
+    hidden = Hidden("servovalve", "white", VARIANCE["servovalve"], ("unknown_cogging",), 11)
+    (made,) = records([hidden], SAMPLES["servovalve"])
+    # As weak as the noise lets anybody see it.
+    hidden = hidden._replace(variance=hidden.variance * worth(hidden, made) / PLAIN)
+    found, _, said = diagnosed(hidden)
+    assert found.verdict == "unexplained" or not found.innocent, said
+    assert found.missing is not None and (found.missing.place, found.missing.quantity) == ("load_force", "position")
+    assert found.missing.period == pytest.approx(made.sizes["unknown_cogging"]["pitch"], rel=0.05), said
+
+
+@of_the_servovalve
 @pytest.mark.parametrize("deviations", [2.6, 6.0])
 def test_readings_coarser_than_the_noise_are_quantised(deviations):
     hidden = Hidden("servovalve", "white", 1e-9, (), 4)

@@ -1,10 +1,12 @@
-"""Terms of free form: curves of straight pieces along what runs along a model, and what they do to its outputs.
+"""Terms of free form: curves along what runs along a model, and what they do to its outputs.
 
 At a place (a force, an opening, a sensor) a term is added that depends on one quantity (velocity, position, spool,
-time, ...). Coefficients of its pieces count in probes, small disturbances at that place.
+time, ...). It is a sum of pieces, straight ones or waves; their coefficients count in probes, small disturbances at
+that place.
 """
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -13,10 +15,12 @@ from jaxtyping import Float
 from ehsvjax.diagnose.workbench import Workbench
 from ehsvjax.models.model import Model
 
-# Pieces of a curve in the tests; along an output, where a term may repeat over short distances, also this many, if
-# there are so many samples for each.
-_COARSE, _CLOSE = 8, 96
-_SAMPLES_PER_PIECE = 50
+# Straight pieces of a curve in the tests. Along an output a term may repeat over short distances: there it is also
+# looked for as waves, at most so many in the range, if there are so many samples for each.
+_COARSE, _WAVES = 8, 24
+_SAMPLES_PER_WAVE = 200
+# Waves in the range that straight pieces follow, the step to the next wave, and knots over each.
+_FOLLOWED, _WAVE_STEP, _KNOTS_PER_WAVE = 2, 0.25, 10
 # Of the range, between two knots: what rests is told apart by rounding alone.
 _LEAST_APART = 1e-4
 _PROBE = 1e-3
@@ -24,13 +28,27 @@ TIME = "time"
 
 
 class Curve(NamedTuple):
-    """Straight pieces along one quantity at one place: `[piece, time]`, and the knots."""
+    """A term of free form along one quantity at one place.
+
+    Attributes:
+        place: signal at which it acts.
+        quantity: that it depends on.
+        knots: `[knot]` ascending values of the quantity.
+        values: `[piece, knot]` each piece there.
+        pieces: `[piece, time]` each piece along the record.
+        relative: whether it is a share of the value at the place.
+        periods: `[wave]` of the waves of which each could be the whole term, in the quantity's unit; none of straight
+            pieces.
+
+    """
 
     place: str
     quantity: str
     knots: Float[np.ndarray, " knot"]
+    values: Float[np.ndarray, "piece knot"]
     pieces: Float[np.ndarray, "piece time"]
     relative: bool
+    periods: Float[np.ndarray, " wave"]
 
 
 def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
@@ -57,32 +75,77 @@ def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
 
 def curves_of_tests(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " time"]]) -> list[Curve]:
     """Return the curves of all tests."""
-    coarse = [c for place in (*bench.places, *bench.problem.observed) for c in _curves(bench, place, seen, _COARSE)]
-    pieces = min(_CLOSE, bench.problem.samples.outputs.shape[1] // _SAMPLES_PER_PIECE)
-    if pieces <= _COARSE:
+    places = (*bench.places, *bench.problem.observed)
+    coarse = [straight_along(bench, place, quantity, seen, _COARSE) for place in places for quantity in seen]
+    waves = min(_WAVES, bench.problem.samples.outputs.shape[1] // _SAMPLES_PER_WAVE)
+    if waves <= _FOLLOWED:
         return coarse
-    outputs = {name: seen[name] for name in bench.problem.observed if name in seen}
-    return coarse + [c for place in bench.places for c in _curves(bench, place, outputs, pieces)]
+    outputs = [name for name in bench.problem.observed if name in seen]
+    return coarse + [_waves_along(bench, place, name, seen[name], waves) for place in bench.places for name in outputs]
 
 
-def curve_along(
+def straight_along(
     bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, " time"]], pieces: int
 ) -> Curve:
-    """Return the curve of so many pieces along one quantity at one place."""
-    (curve,) = _curves(bench, place, {quantity: seen[quantity]}, pieces)
-    return curve
+    """Return the curve of so many straight pieces along a quantity at a place."""
+    knots = knots_along(seen[quantity], pieces)
+    values = np.eye(len(knots))
+    hats = np.stack([np.interp(seen[quantity], knots, value) for value in values])
+    return Curve(place, quantity, knots, values, hats, _is_opening(bench, place), np.zeros(0))
 
 
-def _curves(bench, place, seen, pieces) -> list[Curve]:
-    """Return curves of straight pieces along every quantity at a place."""
-    kinds = {s.name: s.kind for s in bench.fit.model.signals}
-    relative = kinds[place] == "opening"
-    found = []
-    for name, series in seen.items():
-        knots = knots_along(series, pieces)
-        hats = np.stack([np.interp(series, knots, np.eye(len(knots))[k]) for k in range(len(knots))])
-        found.append(Curve(place, name, knots, hats, relative))
-    return found
+def wave_along(
+    bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, " time"]], period: float
+) -> Curve:
+    """Return the curve that repeats with a period of a quantity, in two phases."""
+    series = seen[quantity]
+    knots = np.linspace(series.min(), series.max(), int(np.ptp(series) / period * _KNOTS_PER_WAVE) + 2)
+    number = np.ptp(series) / period
+    return Curve(
+        place, quantity, knots, _phases(_share(knots, series), number), _phases(_share(series, series), number),
+        _is_opening(bench, place), np.array([period]),
+    )  # fmt: skip
+
+
+def _waves_along(bench, place, quantity, series, waves) -> Curve:
+    """Return the curve of all waves of which there are at most so many in the range, in steps of half a wave."""
+    knots = np.linspace(series.min(), series.max(), waves * _KNOTS_PER_WAVE)
+    values, pieces = (_all_waves(_share(along, series), waves) for along in (knots, series))
+    periods = np.ptp(series) / _wave_numbers(waves)
+    return Curve(place, quantity, knots, values, pieces, _is_opening(bench, place), periods)
+
+
+def _share(along, series):
+    return (along - series.min()) / np.ptp(series)
+
+
+def _phases(share, number) -> Float[np.ndarray, "phase point"]:
+    return np.stack([np.cos(2.0 * np.pi * number * share), np.sin(2.0 * np.pi * number * share)])
+
+
+def _all_waves(share, waves) -> Float[np.ndarray, "piece point"]:
+    numbers = np.arange(1, 2 * waves + 1) / 2.0
+    return np.concatenate([np.ones((1, len(share))), *(_phases(share, number) for number in numbers)])
+
+
+def _wave_numbers(waves) -> Float[np.ndarray, " wave"]:
+    return np.arange(_FOLLOWED + _WAVE_STEP, waves + 0.5 * _WAVE_STEP, _WAVE_STEP)
+
+
+@cache
+def single_waves(waves: int) -> Float[np.ndarray, "wave phase piece"]:
+    """Return the coefficients of each single wave in the pieces of a curve of all waves, of which there are so many.
+
+    In steps of a quarter: of a wave that is half a step further from the next, much would be lost.
+    """
+    share = np.linspace(0.0, 1.0, waves * _KNOTS_PER_WAVE)
+    wanted = np.concatenate([_phases(share, number) for number in _wave_numbers(waves)])
+    coefficients = np.linalg.lstsq(_all_waves(share, waves).T, wanted.T, rcond=1e-6)[0].T
+    return coefficients.reshape(-1, 2, coefficients.shape[1])
+
+
+def _is_opening(bench: Workbench, place: str) -> bool:
+    return any(s.name == place and s.kind == "opening" for s in bench.fit.model.signals)
 
 
 def knots_along(series: Float[np.ndarray, " time"], pieces: int) -> Float[np.ndarray, " knot"]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.curves import curve_responses, curves_of_tests
+from ehsvjax.diagnose.curves import Curve, curve_responses, curves_of_tests, single_waves
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
@@ -26,6 +26,7 @@ class Dependence(NamedTuple):
         corrected: of all such tests together.
         explained: noise variances of the residual's sum of squares that such a term takes, more than noise would give.
         pieces: of the curve that the term was tried with.
+        period: in the quantity's unit, if what shows is a term that repeats along it; else None.
 
     """
 
@@ -35,6 +36,7 @@ class Dependence(NamedTuple):
     corrected: float
     explained: float
     pieces: int
+    period: float | None
 
 
 def dependences(
@@ -49,15 +51,16 @@ def dependences(
         seen: the quantities.
 
     """
-    curves, bases, r = _examined(bench, final, white, seen)
-    p_values = [float(_p_value((q.T @ r)[None])[0]) for q in bases]
-    null = smallest_p_values(bases, [_p_value] * len(bases), seed=1)
+    tests, r = _examined(bench, final, white, seen)
+    components = [(test.basis.T @ r)[None] for test in tests]
+    p_values = [float(test.p_value(c)[0]) for test, c in zip(tests, components, strict=True)]
+    null = smallest_p_values([test.basis for test in tests], [test.p_value for test in tests], seed=1)
     found = [
         Dependence(
-            curve.place, curve.quantity, p, corrected(p, null, len(curves)),
-            float(np.sum((q.T @ r) ** 2)) - q.shape[1], len(curve.pieces),
+            test.curve.place, test.curve.quantity, p, corrected(p, null, len(tests)), _explained(test, r),
+            len(test.curve.pieces), _period(test, c),
         )
-        for curve, q, p in zip(curves, bases, p_values, strict=True)
+        for test, p, c in zip(tests, p_values, components, strict=True)
     ]  # fmt: skip
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
 
@@ -66,30 +69,88 @@ def strongest_dependence(
     bench: Workbench, current: Refits, white: Whitening, seen: Mapping[str, Float[np.ndarray, " time"]]
 ) -> float:
     """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
-    _, bases, r = _examined(bench, current, white, seen)
-    return max(float(np.sum((q.T @ r) ** 2)) - q.shape[1] for q in bases)
+    tests, r = _examined(bench, current, white, seen)
+    return max(_explained(test, r) for test in tests)
 
 
-def _examined(bench: Workbench, final: Refits, white: Whitening, seen):
-    """Return the curves that could show at all, orthonormal directions of each, and the residual, all whitened."""
+class _Test(NamedTuple):
+    """A curve, `[sample, direction]` orthonormal directions of what it can do, and those of each of its waves alone."""
+
+    curve: Curve
+    basis: Float[np.ndarray, "sample direction"]
+    waves: Float[np.ndarray, "wave direction phase"]
+
+    def p_value(self, components: Float[np.ndarray, "draw direction"]) -> Float[np.ndarray, " draw"]:
+        """Judge all directions together, and each wave alone: a weak one is lost among as many directions as pieces.
+
+        By Bonferroni's bound: half of the risk for the one, half for the waves.
+        """
+        together = _of_chi_square(np.sum(components**2, axis=-1), components.shape[-1])
+        if not len(self.waves):
+            return together
+        alone = len(self.waves) * _of_chi_square(np.max(self.heights(components), axis=0), 2)
+        return np.minimum(2.0 * np.minimum(together, alone), 1.0)
+
+    def heights(self, components: Float[np.ndarray, "draw direction"]) -> Float[np.ndarray, "wave draw"]:
+        """Return what each wave alone takes of the sum of squares."""
+        return np.stack([np.sum((components @ wave) ** 2, axis=-1) for wave in self.waves])
+
+
+def _explained(test: _Test, r) -> float:
+    return float(np.sum((test.basis.T @ r) ** 2)) - test.basis.shape[1]
+
+
+def _period(test: _Test, components) -> float | None:
+    """Return the period of the strongest wave, if it alone is less likely noise than all that the curve takes."""
+    if not len(test.waves):
+        return None
+    heights = test.heights(components)[:, 0]
+    strongest = int(np.argmax(heights))
+    alone = np.log(len(heights)) + _log_of_chi_square(float(heights[strongest]), 2)
+    together = _log_of_chi_square(float(np.sum(components**2)), components.shape[-1])
+    return float(test.curve.periods[strongest]) if alone < together else None
+
+
+def _of_chi_square(value, freedom: int):
+    from scipy.special import chdtrc
+
+    return chdtrc(freedom, value)
+
+
+def _log_of_chi_square(value: float, freedom: int) -> float:
+    from scipy.special import gammaln
+
+    p = float(_of_chi_square(value, freedom))
+    # Far out the first term of the asymptotic series is all there is (Abramowitz and Stegun 6.5.32).
+    far = (0.5 * freedom - 1.0) * np.log(0.5 * value) - 0.5 * value - gammaln(0.5 * freedom) if value > 0 else 0.0
+    return float(np.log(p) if p > 0 else far)
+
+
+def _examined(bench: Workbench, final: Refits, white: Whitening, seen) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
+    """Return the tests of curves that could show at all, and the whitened residual."""
     curves = curves_of_tests(bench, seen)
     known, r = unexplained(final, white)
     changes = white(curve_responses(bench, final.points[0], curves))
     rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
-    shown = [(curve, q) for curve, part in zip(curves, rows, strict=True) if (q := _outside(known, part)).shape[1]]
-    return [curve for curve, _ in shown], [q for _, q in shown], r
+    tests = []
+    for curve, part in zip(curves, rows, strict=True):
+        outside = part - (part @ known) @ known.T
+        basis = _basis(outside, np.linalg.norm(part, axis=1))
+        if basis.shape[1]:
+            tests.append(_Test(curve, basis, _waves(curve, outside @ basis)))
+    return tests, r
 
 
-def _outside(known, responses) -> Float[np.ndarray, "sample independent"]:
-    """Return an orthonormal basis of the responses outside what the unknowns can do."""
-    norms = np.linalg.norm(responses, axis=1)
-    rows = responses[norms > 0] / norms[norms > 0, None]
-    rows = rows - (rows @ known) @ known.T
+def _basis(outside, norms) -> Float[np.ndarray, "sample direction"]:
+    """Return orthonormal directions of responses outside what the unknowns can do; `norms` are those with it."""
+    rows = outside[norms > 0] / norms[norms > 0, None]
     vectors, values, _ = np.linalg.svd(rows.T, full_matrices=False)
     return vectors[:, values > 1e-4 * max(values[0], 1e-300)] if len(values) else np.zeros((rows.shape[1], 0))
 
 
-def _p_value(components: Float[np.ndarray, "draw direction"]) -> Float[np.ndarray, " draw"]:
-    from scipy.special import chdtrc
-
-    return chdtrc(components.shape[-1], np.sum(components**2, axis=-1))
+def _waves(curve: Curve, along) -> Float[np.ndarray, "wave direction phase"]:
+    """Return orthonormal directions of what each wave alone does, from what the pieces do `[piece, direction]`."""
+    if not len(curve.periods):
+        return np.zeros((0, along.shape[1], 2))
+    alone = single_waves((len(curve.pieces) - 1) // 4) @ along
+    return np.linalg.qr(np.swapaxes(alone, 1, 2))[0]

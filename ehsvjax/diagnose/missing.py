@@ -1,7 +1,7 @@
 """What acts where, without a form assumed: missing terms at a signal as functions of what runs along the model.
 
-A curve of straight pieces is estimated while it acts in the simulation, together with the model's own unknowns, and
-returned as smooth as the record says, with its band.
+A curve of straight pieces, or a single wave, is estimated while it acts in the simulation, together with the model's
+own unknowns, and returned as smooth as the record says, with its band.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,27 +12,31 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.curves import (
     Curve,
-    curve_along,
     outputs_with,
     probe_at,
     quantity_unit,
     slopes_with,
+    straight_along,
+    wave_along,
 )
 from ehsvjax.diagnose.dependence import Dependence
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, bounds_of, span, unexplained
 from ehsvjax.diagnose.significance import INSEPARABLE
-from ehsvjax.diagnose.smoothing import Smooth, smoothed
+from ehsvjax.diagnose.smoothing import Smooth, of_one_wave, smoothed
 from ehsvjax.diagnose.workbench import Workbench
 
 # For each knot of the smooth curve.
 _SAMPLES_PER_KNOT = 50
 # Curves that are drawn with many pieces, of which one is returned.
 _FINALISTS = 3
-# Steps of the estimate of a curve, dampings of each that are simulated, and what the last one gains at most.
-_STEPS = 8
+# Steps of the estimate of a curve, and of the unknowns beside it once it is smooth; dampings of each that are
+# simulated, and what the last one gains at most.
+_STEPS, _STEPS_BESIDE = 8, 4
 _DAMPINGS = (0.0, 1e-4, 1e-2, 0.3)
 _SETTLED, _SETTLED_SHARE = 0.1, 1e-3
+# Share of what a term explains that straight pieces may lack of it.
+_LACKED = 0.01
 # Share of the strongest response of combined pieces below which a record shows nothing.
 _SHOWN = 1e-4
 
@@ -48,8 +52,9 @@ class MissingTerm(NamedTuple):
         deviation: `[knot]` standard deviation of the estimate.
         series: `[time]` the term along the record.
         relative: whether the estimate is a share of the value at the place.
+        period: in the quantity's unit, if the term is a single wave along it; else None.
         explained: share of the residual's sum of squares above the noise that it takes.
-        pieces: effective number of them, for smooth as it is.
+        pieces: effective number of them, for smooth as it is; a single wave counts as three.
         likelihood: twice its logarithm with this term, less Bayes' price for its pieces; for one output.
         alike: other places and quantities, by whose curves the record is explained as well, `(place, quantity)`.
 
@@ -64,6 +69,7 @@ class MissingTerm(NamedTuple):
     deviation: Float[np.ndarray, " knot"]
     series: Float[np.ndarray, " time"]
     relative: bool
+    period: float | None
     explained: float
     pieces: float
     likelihood: float
@@ -87,14 +93,20 @@ def missing_term(
     known, r = unexplained(final, white)
     knots = len(r) // _SAMPLES_PER_KNOT
 
-    def drawn(place, quantity, pieces, start=None):
-        return _drawn(_settled(bench, final, white, curve_along(bench, place, quantity, seen, pieces), start))
+    def drawn(suspect):
+        if suspect.period is not None:
+            curve = wave_along(bench, suspect.place, suspect.quantity, seen, suspect.period)
+        else:
+            curve = straight_along(bench, suspect.place, suspect.quantity, seen, suspect.pieces)
+        return _drawn(bench, final, white, curve, final.points[0], np.zeros(len(curve.pieces)))
 
     def drawn_finely(coarse):
         start = coarse.settled
-        return min(coarse, drawn(*start.curve[:2], max(len(start.coefficients), knots), start), key=_cost)
+        fine = straight_along(bench, *start.curve[:2], seen, max(len(start.coefficients), knots))
+        begun = np.interp(fine.knots, start.curve.knots, start.coefficients @ start.curve.values)
+        return min(coarse, _drawn(bench, final, white, fine, start.point, begun), key=_cost)
 
-    every = sorted((drawn(s.place, s.quantity, s.pieces) for s in suspects), key=_cost)
+    every = sorted((drawn(s) for s in suspects), key=_cost)
     different: dict[tuple[str, str], _Drawn] = {}
     for d in every:
         different.setdefault((d.settled.curve.place, d.settled.curve.quantity), d)
@@ -105,7 +117,7 @@ def missing_term(
     curve, smooth, left = best.settled.curve, best.smooth, best.left
     place, quantity = curve[:2]
     probe = probe_at(bench, place)
-    estimate, deviation = smooth.coefficients * probe, smooth.deviation * probe
+    variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - left - smooth.pieces
     return MissingTerm(
@@ -114,10 +126,11 @@ def missing_term(
         quantity=quantity,
         quantity_unit=quantity_unit(bench.fit.model, quantity),
         at=curve.knots,
-        estimate=estimate,
-        deviation=deviation,
-        series=estimate @ curve.pieces,
+        estimate=probe * smooth.coefficients @ curve.values,
+        deviation=probe * np.sqrt(variances),
+        series=probe * smooth.coefficients @ curve.pieces,
         relative=curve.relative,
+        period=float(curve.periods[0]) if len(curve.periods) else None,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
         pieces=smooth.pieces,
         likelihood=likelihood(left, len(r), white) - smooth.pieces * float(np.log(len(r))),
@@ -160,12 +173,19 @@ class _Drawn(NamedTuple):
     cost: float
 
 
-def _drawn(settled: _Settled) -> _Drawn:
-    smooth = smoothed(settled.curve.knots, settled.responses, settled.readings)
+def _drawn(bench: Workbench, final: Refits, white: Whitening, curve: Curve, point, coefficients) -> _Drawn:
+    settled = _settled(bench, final, white, curve, point, coefficients)
+    responses, readings = settled.responses, settled.readings
+    smooth = of_one_wave(responses, readings) if len(curve.periods) else smoothed(curve.knots, responses, readings)
     # What the unknowns took beside the curve stays taken.
-    beside = settled.left - float(np.sum((settled.readings - settled.coefficients @ settled.responses) ** 2))
-    without = beside + float(settled.readings @ settled.readings)
-    return _Drawn(settled, smooth, beside + smooth.left, without - smooth.evidence)
+    beside = settled.left - float(np.sum((readings - settled.coefficients @ responses) ** 2))
+    without = beside + float(readings @ readings)
+    # What the record hardly tells may have gone so far that the smooth curve is another one once it is simulated.
+    whole = curve._replace(
+        values=smooth.coefficients[None] @ curve.values, pieces=smooth.coefficients[None] @ curve.pieces
+    )
+    left = _settled(bench, final, white, whole, settled.point, np.ones(1), _STEPS_BESIDE).left
+    return _Drawn(settled, smooth, left, without - smooth.evidence + max(left - beside - smooth.left, 0.0))
 
 
 def _cost(drawn: _Drawn) -> float:
@@ -173,25 +193,27 @@ def _cost(drawn: _Drawn) -> float:
 
 
 def _alike(some: Sequence[_Drawn]) -> list[_Drawn]:
-    """Return those that explain a record as well as the best of them."""
-    least = min(d.cost for d in some)
-    return [d for d in some if d.cost <= least + INSEPARABLE]
+    """Return those that explain a record as well as the best of them.
 
-
-def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, start: _Settled | None) -> _Settled:
-    """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each.
-
-    It starts where another curve at the same place has settled, or without any.
+    A term that is far above the noise shows what straight pieces between knots lack of it; nothing below tells places
+    apart.
     """
-    readings = bench.problem.samples.outputs
+    best = min(some, key=_cost)
+    above = best.left - (len(best.settled.readings) - best.smooth.pieces)
+    lacking = min(above, _LACKED * best.smooth.evidence)
+    return [d for d in some if d.cost <= best.cost + max(INSEPARABLE, lacking)]
+
+
+def _settled(
+    bench: Workbench, final: Refits, white: Whitening, curve: Curve, point, coefficients, steps=_STEPS
+) -> _Settled:
+    """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each."""
+    measured = bench.problem.samples.outputs
     columns = final.chosen[0][final.chosen[0] >= 0]
     lower, upper = bounds_of(bench)
-    point, coefficients = final.points[0], np.zeros(len(curve.pieces))
-    if start is not None:
-        point, coefficients = start.point, np.interp(curve.knots, start.curve.knots, start.coefficients)
-    r = white(readings - outputs_with(bench, point[None], coefficients[None], curve)[0])
+    r = white(measured - outputs_with(bench, point[None], coefficients[None], curve)[0])
     left = float(np.nan_to_num(r @ r, nan=np.inf))
-    for _ in range(_STEPS):
+    for _ in range(steps):
         rows = white(slopes_with(bench, point, columns, coefficients, curve))
         points, curves = [], []
         for change in _damped_steps(rows, r):
@@ -199,9 +221,10 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, st
             moved[columns] = np.clip(point[columns] + change[: len(columns)], lower[columns], upper[columns])
             points.append(moved)
             curves.append(coefficients + change[len(columns) :])
-        residuals = white(readings - outputs_with(bench, np.stack(points), np.stack(curves), curve))
+        residuals = white(measured - outputs_with(bench, np.stack(points), np.stack(curves), curve))
         costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
-        best = int(np.argmin(costs))
+        # The most damped of those as good: what the record hardly tells is not to wander.
+        best = int(np.flatnonzero(costs <= np.min(costs) + _SETTLED)[-1])
         gain = left - costs[best]
         if gain > 0:
             point, coefficients, r, left = points[best], curves[best], residuals[best], float(costs[best])
@@ -209,7 +232,8 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, st
             break
     known = span(rows[: len(columns)])
     responses = rows[len(columns) :] - (rows[len(columns) :] @ known) @ known.T
-    return _Settled(curve, point, coefficients, left, r - known @ (known.T @ r) + coefficients @ responses, responses)
+    readings = r - known @ (known.T @ r) + coefficients @ responses
+    return _Settled(curve, point, coefficients, left, readings, responses)
 
 
 def _decomposed(rows):

@@ -125,5 +125,5 @@ def _draw_missing(axes, diagnosis: Diagnosis) -> None:
     # Where hardly anything was seen, the band would hide the rest.
     reach = 2.0 * float(np.max(np.abs(m.estimate))) / size
     axes.set_ylim(max(-reach, axes.get_ylim()[0]), min(reach, axes.get_ylim()[1]))
-    axes.set(xlabel=f"{_words(m.quantity)} {label}", ylabel=f"missing at {_words(m.place)} ({unit})",
-             title="the missing term, no form assumed")  # fmt: skip
+    title = "the missing term, " + ("no form assumed" if m.period is None else "as a single wave")
+    axes.set(xlabel=f"{_words(m.quantity)} {label}", ylabel=f"missing at {_words(m.place)} ({unit})", title=title)

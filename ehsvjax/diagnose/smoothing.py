@@ -1,4 +1,4 @@
-"""Curves that are as smooth as a record says."""
+"""Curves that are as smooth as a record says, and single waves."""
 
 from typing import NamedTuple
 
@@ -10,17 +10,18 @@ from jaxtyping import Float
 _WEIGHTS, _BEYOND = 50, 10.0
 # Share of the strongest information below which a record tells nothing.
 _TOLD = 1e-8
+_NUMBERS_OF_A_WAVE = 3.0
 
 
 class Smooth(NamedTuple):
-    """A smooth curve: its coefficients, their standard deviations, how many pieces it effectively has.
+    """A smooth curve: its coefficients, their covariance, how many pieces it effectively has.
 
     `left` is the sum of squares of the residual that it leaves, `evidence` twice the logarithm of how much more
     probable the readings are with some curve as smooth as this than without, in the same unit.
     """
 
     coefficients: Float[np.ndarray, " knot"]
-    deviation: Float[np.ndarray, " knot"]
+    covariance: Float[np.ndarray, "knot knot"]
     pieces: float
     left: float
     evidence: float
@@ -75,11 +76,21 @@ def smoothed(
     coefficients = root @ (kept * z)
     return Smooth(
         coefficients,
-        np.sqrt(root**2 @ kept),
+        (root * kept) @ root.T,
         float(np.sum(kept)),
         float(np.sum((readings - coefficients @ responses) ** 2)),
-        -cost(best) * variance,
+        # What is not rough at all has Bayes' price: two numbers are not for nothing.
+        -(cost(best) + np.sum(roughness == 0) * np.log(len(readings))) * variance,
     )
+
+
+def of_one_wave(responses: Float[np.ndarray, "phase sample"], readings: Float[np.ndarray, " sample"]) -> Smooth:
+    """Return the wave of some period that explains whitened readings best; two phases and a period have their price."""
+    coefficients = np.linalg.lstsq(responses.T, readings, rcond=_TOLD**0.5)[0]
+    left = float(np.sum((readings - coefficients @ responses) ** 2))
+    evidence = float(readings @ readings) - left - _NUMBERS_OF_A_WAVE * float(np.log(len(readings)))
+    covariance = np.linalg.pinv(responses @ responses.T, rcond=_TOLD, hermitian=True)
+    return Smooth(coefficients, covariance, _NUMBERS_OF_A_WAVE, left, evidence)
 
 
 def _roughness(knots) -> Float[np.ndarray, "knot knot"]:

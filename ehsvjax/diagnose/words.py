@@ -4,6 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ehsvjax.diagnose.curves import quantity_unit
+
 if TYPE_CHECKING:
     from ehsvjax.diagnose.diagnosis import Diagnosis
 
@@ -57,9 +59,10 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
             )
     first = diagnosis.misfit.tests[0]
     if diagnosis.verdict != "adequate":
+        repeating = _repeating(first.period, quantity_unit(diagnosis.fit.model, first.quantity))
         lines.append(
-            f"the residual depends on {first.quantity} (seen from {first.place}): p = {_p(first.corrected)} for all "
-            f"{len(diagnosis.misfit.tests)} tests together"
+            f"the residual depends on {first.quantity}{repeating} (seen from {first.place}): p = "
+            f"{_p(first.corrected)} for all {len(diagnosis.misfit.tests)} tests together"
         )
     return lines
 
@@ -90,11 +93,11 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
         peak = int(np.argmax(np.abs(m.estimate)))
         # Several causes may stand for one that the bank lacks.
         instead = diagnosis.innocent and diagnosis.verdict != "unexplained"
+        along = f"as a function of {m.quantity}{_repeating(m.period, m.quantity_unit)}"
         lines.append(
-            f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, as a "
-            f"function of {m.quantity}: up to {m.estimate[peak]:.3g} +/- {m.deviation[peak]:.2g}{unit} at "
-            f"{m.at[peak]:.3g}{_spaced(m.quantity_unit)}; it takes {100 * m.explained:.0f}% of what is left "
-            "(see .missing and .plot())"
+            f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, {along}: "
+            f"up to {m.estimate[peak]:.3g} +/- {m.deviation[peak]:.2g}{unit} at {m.at[peak]:.3g}"
+            f"{_spaced(m.quantity_unit)}; it takes {100 * m.explained:.0f}% of what is left (see .missing and .plot())"
         )
         if m.alike:
             others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
@@ -143,6 +146,10 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
         if diagnosis.unseen:
             lines.append(f"cannot be seen in this record: {', '.join(diagnosis.unseen)}")
     return lines
+
+
+def _repeating(period: float | None, unit: str) -> str:
+    return "" if period is None else f", repeating every {period:.3g}{_spaced(unit)}"
 
 
 def _spaced(unit: str) -> str:
