@@ -64,8 +64,14 @@ def remaining_term(examined: Examination) -> MissingTerm | None:
         return examined.instead
     selection = examined.selection
     return missing_term(
-        selection.bench, selection.final, selection.white, selection.seen, examined.after[:_SUSPECTS]
+        selection.bench, selection.final, selection.white, selection.seen, _suspects(examined.after)
     )  # fmt: skip
+
+
+def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
+    """Return the dependences that are followed up: the most significant, and those of a place on itself."""
+    at_home = (t for t in tests[_SUSPECTS:] if t.place == t.quantity and t.corrected < SIGNIFICANT)
+    return (*tests[:_SUSPECTS], *at_home)
 
 
 def _depends(selection: Selection, tests: tuple[Dependence, ...]) -> bool:
@@ -106,7 +112,7 @@ def _random_force(
             return None, bool(single and better > -INSEPARABLE)
     if before[0].corrected < SIGNIFICANT:
         # A term that depends on what runs along the model is a better reason than chance.
-        term = missing_term(bench, selection.nominal, selection.white, selection.seen, before[:_SUSPECTS])
+        term = missing_term(bench, selection.nominal, selection.white, selection.seen, _suspects(before))
         if term.likelihood > nominal.likelihood:
             return None, False
     return nominal, False
@@ -117,7 +123,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[Miss
     if len(selection.included) < 2:
         return None, False
     white = selection.white
-    term = missing_term(selection.bench, selection.nominal, white, selection.seen, before[:_SUSPECTS])
+    term = missing_term(selection.bench, selection.nominal, white, selection.seen, _suspects(before))
     r = white(selection.final.residual[0])
     price = float(np.log(len(r)))
     causes = likelihood(float(r @ r), len(r), white) - price * sum(_numbers(selection, i) for i in selection.included)

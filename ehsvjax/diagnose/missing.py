@@ -37,8 +37,9 @@ _DAMPINGS = (0.0, 1e-4, 1e-2, 0.3)
 _SETTLED, _SETTLED_SHARE = 0.1, 1e-3
 # Share of what a term explains that straight pieces may lack of it.
 _LACKED = 0.01
-# Share of the strongest response of combined pieces below which a record shows nothing.
-_SHOWN = 1e-4
+# Share of the strongest response of combined pieces below which a record shows nothing, and of their own one outside
+# of what the unknowns can do, below which it is the unknowns'.
+_SHOWN, _OWN = 1e-4, 0.01
 
 
 class MissingTerm(NamedTuple):
@@ -109,10 +110,12 @@ def missing_term(
     every = sorted((drawn(s) for s in suspects), key=_cost)
     different: dict[tuple[str, str], _Drawn] = {}
     for d in every:
-        different.setdefault((d.settled.curve.place, d.settled.curve.quantity), d)
-    finalists = [drawn_finely(d) for d in list(different.values())[:_FINALISTS]]
+        different.setdefault(d.settled.curve[:2], d)
+    # Few pieces say little of a narrow term: what is at home has its chance as well.
+    ranked = list(different.values())
+    finalists = [drawn_finely(d) for d in [*ranked[:_FINALISTS], *filter(_at_home, ranked[_FINALISTS:])]]
     alike = _alike(finalists)
-    best = min(alike, key=lambda d: (d.settled.curve.place != d.settled.curve.quantity, d.cost))
+    best = min(alike, key=lambda d: (not _at_home(d), d.cost))
     others = dict.fromkeys(d.settled.curve[:2] for d in (*alike, *_alike(every)))
     curve, smooth, left = best.settled.curve, best.smooth, best.left
     place, quantity = curve[:2]
@@ -192,6 +195,10 @@ def _cost(drawn: _Drawn) -> float:
     return drawn.cost
 
 
+def _at_home(drawn: _Drawn) -> bool:
+    return drawn.settled.curve.place == drawn.settled.curve.quantity
+
+
 def _alike(some: Sequence[_Drawn]) -> list[_Drawn]:
     """Return those that explain a record as well as the best of them.
 
@@ -215,12 +222,13 @@ def _settled(
     left = float(np.nan_to_num(r @ r, nan=np.inf))
     for _ in range(steps):
         rows = white(slopes_with(bench, point, columns, coefficients, curve))
+        unknowns, pieces = rows[: len(columns)], rows[len(columns) :]
         points, curves = [], []
-        for change in _damped_steps(rows, r):
+        for of_unknowns, of_pieces in _damped_steps(unknowns, pieces, r):
             moved = point.copy()
-            moved[columns] = np.clip(point[columns] + change[: len(columns)], lower[columns], upper[columns])
+            moved[columns] = np.clip(point[columns] + of_unknowns, lower[columns], upper[columns])
             points.append(moved)
-            curves.append(coefficients + change[len(columns) :])
+            curves.append(coefficients + of_pieces)
         residuals = white(measured - outputs_with(bench, np.stack(points), np.stack(curves), curve))
         costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
         # The most damped of those as good: what the record hardly tells is not to wander.
@@ -230,22 +238,47 @@ def _settled(
             point, coefficients, r, left = points[best], curves[best], residuals[best], float(costs[best])
         if not gain > max(_SETTLED, _SETTLED_SHARE * left):
             break
-    known = span(rows[: len(columns)])
-    responses = rows[len(columns) :] - (rows[len(columns) :] @ known) @ known.T
+    known = span(unknowns)
+    responses = _outside(pieces, known)
     readings = r - known @ (known.T @ r) + coefficients @ responses
     return _Settled(curve, point, coefficients, left, readings, responses)
 
 
-def _decomposed(rows):
-    """Return the singular vectors and values of responses of unit length, and these lengths' inverses."""
-    norms = np.linalg.norm(rows, axis=1)
+def _damped_steps(unknowns, pieces, r) -> list[tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " piece"]]]:
+    """Return Levenberg-Marquardt steps of several dampings each, from whitened responses.
+
+    What the unknowns can do is theirs, and a curve stays where it is in whatever the record does not show beside them:
+    a change that both can make would be shared, and the curve wander.
+    """
+    outside = _outside(pieces, span(unknowns))
+    steps = []
+    for damping in _DAMPINGS:
+        of_pieces = _damped(outside, np.linalg.norm(pieces, axis=1), r, damping)
+        beside = r - of_pieces @ pieces
+        steps.append((_damped(unknowns, np.linalg.norm(unknowns, axis=1), beside, damping), of_pieces))
+    return steps
+
+
+def _outside(pieces, known) -> Float[np.ndarray, "piece sample"]:
+    """Return responses outside of what the unknowns can do, and nothing of combinations that hardly reach beyond it."""
+    norms = np.linalg.norm(pieces, axis=1)
+    scaled = pieces[norms > 0] / norms[norms > 0, None]
+    left, values, right = np.linalg.svd(scaled, full_matrices=False)
+    # Sines of the principal angles between what the pieces and what the unknowns can do (Bjorck and Golub 1973).
+    turned, cosines, _ = np.linalg.svd(right @ known)
+    sines = np.ones(len(turned))
+    sines[: len(cosines)] = np.sqrt(np.maximum(1.0 - cosines**2, 0.0))
+    own = turned[:, sines > _OWN].T @ right
+    responses = np.zeros_like(pieces)
+    responses[norms > 0] = norms[norms > 0, None] * (
+        (left * values) @ turned[:, sines > _OWN] @ (own - (own @ known) @ known.T)
+    )
+    return responses
+
+
+def _damped(responses, norms, r, damping: float) -> Float[np.ndarray, " direction"]:
+    """Return damped least squares of responses in units of these norms; what is not shown at all stays where it is."""
     scale = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
-    return *np.linalg.svd((rows * scale[:, None]).T, full_matrices=False), scale
-
-
-def _damped_steps(rows, r) -> list[Float[np.ndarray, " direction"]]:
-    """Return Levenberg-Marquardt steps of several dampings; what the record does not show at all stays where it is."""
-    vectors, values, others, scale = _decomposed(rows)
-    along = vectors.T @ r
+    vectors, values, others = np.linalg.svd((responses * scale[:, None]).T, full_matrices=False)
     shown = values > _SHOWN * values[0]
-    return [scale * (others.T @ (np.where(shown, values / (values**2 + d + 1e-300), 0.0) * along)) for d in _DAMPINGS]
+    return scale * (others.T @ (np.where(shown, values / (values**2 + damping + 1e-300), 0.0) * (vectors.T @ r)))
