@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnose.curves import (
+    TIME,
     Curve,
     outputs_with,
     probe_at,
@@ -33,13 +34,17 @@ _FINALISTS = 3
 # Steps of the estimate of a curve, and of the unknowns beside it once it is smooth; dampings of each that are
 # simulated, and what the last one gains at most.
 _STEPS, _STEPS_BESIDE = 8, 4
-_DAMPINGS = (0.0, 1e-4, 1e-2, 0.3)
+_DAMPINGS = (0.0, 1e-4, 1e-2, 0.3, 10.0)
 _SETTLED, _SETTLED_SHARE = 0.1, 1e-3
+# Times that a term's simplest form is reweighted, and share of its height that counts as nothing in it.
+_REWEIGHTED, _NOTHING = 30, 1e-3
 # Share of what a term explains that straight pieces may lack of it.
 _LACKED = 0.01
 # Share of the strongest response of combined pieces below which a record shows nothing, and of their own one outside
 # of what the unknowns can do, below which it is the unknowns'.
 _SHOWN, _OWN = 1e-4, 0.01
+# Share of the strongest response below which combined ones are rounding.
+_INDEPENDENT = 1e-9
 
 
 class MissingTerm(NamedTuple):
@@ -115,11 +120,14 @@ def missing_term(
     ranked = list(different.values())
     finalists = [drawn_finely(d) for d in [*ranked[:_FINALISTS], *filter(_at_home, ranked[_FINALISTS:])]]
     alike = _alike(finalists)
-    best = min(alike, key=lambda d: (not _at_home(d), d.cost))
+    # Whatever moves is a function of time: that is the last of all reasons.
+    best = min(alike, key=lambda d: (not _at_home(d), d.settled.curve.quantity == TIME, d.cost))
     others = dict.fromkeys(d.settled.curve[:2] for d in (*alike, *_alike(every)))
     curve, smooth, left = best.settled.curve, best.smooth, best.left
     place, quantity = curve[:2]
     probe = probe_at(bench, place)
+    free = best.settled.free
+    coefficients = smooth.coefficients + _least(smooth.coefficients @ curve.pieces, free @ curve.pieces) @ free
     variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - left - smooth.pieces
@@ -129,9 +137,9 @@ def missing_term(
         quantity=quantity,
         quantity_unit=quantity_unit(bench.fit.model, quantity),
         at=curve.knots,
-        estimate=probe * smooth.coefficients @ curve.values,
+        estimate=probe * coefficients @ curve.values,
         deviation=probe * np.sqrt(variances),
-        series=probe * smooth.coefficients @ curve.pieces,
+        series=probe * coefficients @ curve.pieces,
         relative=curve.relative,
         period=float(curve.periods[0]) if len(curve.periods) else None,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
@@ -146,6 +154,19 @@ def likelihood(left: float, count: int, white: Whitening) -> float:
     return -float(count * np.log(white.noises[0].innovation_variance * left / count)) - count
 
 
+def _least(term, free) -> Float[np.ndarray, " line"]:
+    """Return how much of what the unknowns make up for makes a term the least: a bump stands on nothing then.
+
+    The least sum of absolute values along the record, by reweighted least squares.
+    """
+    amounts = np.zeros(len(free))
+    for _ in range(_REWEIGHTED):
+        size = np.abs(term + amounts @ free)
+        weights = 1.0 / np.sqrt(np.maximum(size, _NOTHING * np.max(size) + 1e-300))
+        amounts = -np.linalg.lstsq((free * weights).T, term * weights, rcond=None)[0]
+    return amounts
+
+
 class _Settled(NamedTuple):
     """A curve, where it has settled.
 
@@ -156,6 +177,7 @@ class _Settled(NamedTuple):
         left: the sum of squares of the whitened residual that it leaves.
         readings: whitened: that residual with what the curve explains, outside of what the refitted unknowns can do.
         responses: of each piece, the same.
+        free: straight lines that the unknowns make up for: any amount of them explains the record as well.
 
     """
 
@@ -165,6 +187,7 @@ class _Settled(NamedTuple):
     left: float
     readings: Float[np.ndarray, " sample"]
     responses: Float[np.ndarray, "piece sample"]
+    free: Float[np.ndarray, "line piece"]
 
 
 class _Drawn(NamedTuple):
@@ -241,7 +264,7 @@ def _settled(
     known = span(unknowns)
     responses = _outside(pieces, known)
     readings = r - known @ (known.T @ r) + coefficients @ responses
-    return _Settled(curve, point, coefficients, left, readings, responses)
+    return _Settled(curve, point, coefficients, left, readings, responses, _free(curve, pieces, known))
 
 
 def _damped_steps(unknowns, pieces, r) -> list[tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " piece"]]]:
@@ -263,17 +286,33 @@ def _outside(pieces, known) -> Float[np.ndarray, "piece sample"]:
     """Return responses outside of what the unknowns can do, and nothing of combinations that hardly reach beyond it."""
     norms = np.linalg.norm(pieces, axis=1)
     scaled = pieces[norms > 0] / norms[norms > 0, None]
-    left, values, right = np.linalg.svd(scaled, full_matrices=False)
-    # Sines of the principal angles between what the pieces and what the unknowns can do (Bjorck and Golub 1973).
-    turned, cosines, _ = np.linalg.svd(right @ known)
+    combinations, sines = _angles(scaled, known)
+    own = combinations[sines > _OWN] @ scaled
+    responses = np.zeros_like(pieces)
+    responses[norms > 0] = norms[norms > 0, None] * (scaled @ own.T @ (own - (own @ known) @ known.T))
+    return responses
+
+
+def _free(curve: Curve, pieces, known) -> Float[np.ndarray, "line piece"]:
+    """Return the straight lines along a curve that the unknowns make up for; no single wave has any."""
+    if len(curve.periods) or len(curve.pieces) == 1:
+        return np.zeros((0, len(curve.pieces)))
+    straight = np.stack([np.ones(len(curve.knots)), (curve.knots - curve.knots.mean()) / np.ptp(curve.knots)])
+    combinations, sines = _angles(straight @ pieces, known)
+    return combinations[sines <= _OWN] @ straight
+
+
+def _angles(responses, known) -> tuple[Float[np.ndarray, "direction response"], Float[np.ndarray, " direction"]]:
+    """Return combinations of responses that are orthonormal, and how far each reaches beyond what the unknowns can do.
+
+    As the sines of the principal angles between both (Bjorck and Golub 1973).
+    """
+    left, values, right = np.linalg.svd(responses, full_matrices=False)
+    shown = values > _INDEPENDENT * values[0]
+    turned, cosines, _ = np.linalg.svd(right[shown] @ known)
     sines = np.ones(len(turned))
     sines[: len(cosines)] = np.sqrt(np.maximum(1.0 - cosines**2, 0.0))
-    own = turned[:, sines > _OWN].T @ right
-    responses = np.zeros_like(pieces)
-    responses[norms > 0] = norms[norms > 0, None] * (
-        (left * values) @ turned[:, sines > _OWN] @ (own - (own @ known) @ known.T)
-    )
-    return responses
+    return turned.T @ (left[:, shown] / values[shown]).T, sines
 
 
 def _damped(responses, norms, r, damping: float) -> Float[np.ndarray, " direction"]:
