@@ -247,7 +247,9 @@ def _settled(
         rows = white(slopes_with(bench, point, columns, coefficients, curve))
         unknowns, pieces = rows[: len(columns)], rows[len(columns) :]
         points, curves = [], []
-        for of_unknowns, of_pieces in _damped_steps(unknowns, pieces, r):
+        # In coordinates of what they span, as there are many more samples than pieces.
+        spanned = np.asarray(np.linalg.qr(np.vstack([rows, r]).T, mode="r")).T
+        for of_unknowns, of_pieces in _damped_steps(spanned[: len(columns)], spanned[len(columns) : -1], spanned[-1]):
             moved = point.copy()
             moved[columns] = np.clip(point[columns] + of_unknowns, lower[columns], upper[columns])
             points.append(moved)
@@ -273,12 +275,12 @@ def _damped_steps(unknowns, pieces, r) -> list[tuple[Float[np.ndarray, " unknown
     What the unknowns can do is theirs, and a curve stays where it is in whatever the record does not show beside them:
     a change that both can make would be shared, and the curve wander.
     """
-    outside = _outside(pieces, span(unknowns))
+    outside = _decomposed(_outside(pieces, span(unknowns)), np.linalg.norm(pieces, axis=1))
+    inside = _decomposed(unknowns, np.linalg.norm(unknowns, axis=1))
     steps = []
     for damping in _DAMPINGS:
-        of_pieces = _damped(outside, np.linalg.norm(pieces, axis=1), r, damping)
-        beside = r - of_pieces @ pieces
-        steps.append((_damped(unknowns, np.linalg.norm(unknowns, axis=1), beside, damping), of_pieces))
+        of_pieces = _damped(outside, r, damping)
+        steps.append((_damped(inside, r - of_pieces @ pieces, damping), of_pieces))
     return steps
 
 
@@ -315,9 +317,14 @@ def _angles(responses, known) -> tuple[Float[np.ndarray, "direction response"], 
     return turned.T @ (left[:, shown] / values[shown]).T, sines
 
 
-def _damped(responses, norms, r, damping: float) -> Float[np.ndarray, " direction"]:
-    """Return damped least squares of responses in units of these norms; what is not shown at all stays where it is."""
+def _decomposed(responses, norms):
+    """Return singular vectors and values of responses in units of these norms, and the units."""
     scale = np.where(norms > 0, 1.0 / np.where(norms > 0, norms, 1.0), 0.0)
-    vectors, values, others = np.linalg.svd((responses * scale[:, None]).T, full_matrices=False)
+    return *np.linalg.svd((responses * scale[:, None]).T, full_matrices=False), scale
+
+
+def _damped(decomposed, r, damping: float) -> Float[np.ndarray, " direction"]:
+    """Return damped least squares of decomposed responses; what is not shown at all stays where it is."""
+    vectors, values, others, scale = decomposed
     shown = values > _SHOWN * values[0]
     return scale * (others.T @ (np.where(shown, values / (values**2 + damping + 1e-300), 0.0) * (vectors.T @ r)))
