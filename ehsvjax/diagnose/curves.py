@@ -99,8 +99,8 @@ def wave_along(
 ) -> Curve:
     """Return the curve that repeats with a period of a quantity, in two phases."""
     series = seen[quantity]
-    knots = np.linspace(series.min(), series.max(), int(np.ptp(series) / period * _KNOTS_PER_WAVE) + 2)
     number = np.ptp(series) / period
+    knots = np.linspace(series.min(), series.max(), int(number * _KNOTS_PER_WAVE) + 2)
     return Curve(
         place, quantity, knots, _phases(_share(knots, series), number), _phases(_share(series, series), number),
         _is_opening(bench, place), np.array([period]),
@@ -126,6 +126,11 @@ def _phases(share, number) -> Float[np.ndarray, "phase point"]:
 def _all_waves(share, waves) -> Float[np.ndarray, "piece point"]:
     numbers = np.arange(1, 2 * waves + 1) / 2.0
     return np.concatenate([np.ones((1, len(share))), *(_phases(share, number) for number in numbers)])
+
+
+def waves_in(curve: Curve) -> int:
+    """Return how many waves there are in the range at most, of a curve of all waves."""
+    return (len(curve.pieces) - 1) // 4
 
 
 def _wave_numbers(waves) -> Float[np.ndarray, " wave"]:
@@ -163,8 +168,7 @@ def knots_along(series: Float[np.ndarray, " time"], pieces: int) -> Float[np.nda
 
 def probe_at(bench: Workbench, place: str) -> float:
     """Return the size of a small disturbance at a place: a share of its value where it has one."""
-    kinds = {s.name: s.kind for s in bench.fit.model.signals}
-    if kinds[place] == "opening" or place in bench.problem.observed:
+    if _is_opening(bench, place) or place in bench.problem.observed:
         return _PROBE
     largest = float(np.max(np.abs(bench.internal.values[place])))
     return _PROBE * largest if largest > 0 else _PROBE

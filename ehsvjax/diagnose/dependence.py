@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.curves import Curve, curve_responses, curves_of_tests, single_waves
+from ehsvjax.diagnose.curves import Curve, curve_responses, curves_of_tests, single_waves, waves_in
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
@@ -57,7 +57,7 @@ def dependences(
     null = smallest_p_values([test.basis for test in tests], [test.p_value for test in tests], seed=1)
     found = [
         Dependence(
-            test.curve.place, test.curve.quantity, p, corrected(p, null, len(tests)), _explained(test, r),
+            test.curve.place, test.curve.quantity, p, corrected(p, null, len(tests)), _explained(c),
             len(test.curve.pieces), _period(test, c),
         )
         for test, p, c in zip(tests, p_values, components, strict=True)
@@ -70,7 +70,7 @@ def strongest_dependence(
 ) -> float:
     """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
     tests, r = _examined(bench, current, white, seen)
-    return max(_explained(test, r) for test in tests)
+    return max(_explained(test.basis.T @ r) for test in tests)
 
 
 class _Test(NamedTuple):
@@ -96,8 +96,8 @@ class _Test(NamedTuple):
         return np.stack([np.sum((components @ wave) ** 2, axis=-1) for wave in self.waves])
 
 
-def _explained(test: _Test, r) -> float:
-    return float(np.sum((test.basis.T @ r) ** 2)) - test.basis.shape[1]
+def _explained(components) -> float:
+    return float(np.sum(components**2)) - components.shape[-1]
 
 
 def _period(test: _Test, components) -> float | None:
@@ -152,5 +152,5 @@ def _waves(curve: Curve, along) -> Float[np.ndarray, "wave direction phase"]:
     """Return orthonormal directions of what each wave alone does, from what the pieces do `[piece, direction]`."""
     if not len(curve.periods):
         return np.zeros((0, along.shape[1], 2))
-    alone = single_waves((len(curve.pieces) - 1) // 4) @ along
+    alone = single_waves(waves_in(curve)) @ along
     return np.linalg.qr(np.swapaxes(alone, 1, 2))[0]

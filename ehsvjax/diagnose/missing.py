@@ -36,7 +36,7 @@ _FINALISTS = 3
 _STEPS, _STEPS_BESIDE = 8, 4
 _DAMPINGS = (0.0, 1e-4, 1e-2, 0.3, 10.0)
 _SETTLED, _SETTLED_SHARE = 0.1, 1e-3
-# Times that a term's simplest form is reweighted, and share of its height that counts as nothing in it.
+# Times that the least of equal terms is reweighted, and share of its height that counts as nothing in it.
 _REWEIGHTED, _NOTHING = 30, 1e-3
 # Share of what a term explains that straight pieces may lack of it.
 _LACKED = 0.01
