@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import ehsvjax
+from ehsvjax.diagnose.curves import bench_with, outputs_with, quantities, straight_along
 from ehsvjax.diagnose.noise import plain_noise
-from ehsvjax.diagnose.refits import padded
+from ehsvjax.diagnose.refits import padded, refit
 from ehsvjax.diagnose.screening import Screened
 from ehsvjax.diagnose.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnose.workbench import workbench
@@ -64,6 +65,34 @@ def test_points_are_simulated_alike_alone_and_among_many(bench):
     together = bench.simulated(points, added)
     for i in (0, 15, 16, 36):
         np.testing.assert_array_equal(bench.simulated(points[i : i + 1], added[i : i + 1])[0], together[i])
+
+
+@pytest.mark.parametrize("place", ["force", "position"])
+def test_a_curve_that_always_acts_leaves_what_it_leaves_among_others(bench, place):
+    curve = straight_along(bench, place, "position", quantities(bench), 9)
+    coefficients = np.random.default_rng(9).uniform(-30.0, 30.0, 9)
+    points = bench.nominal[None]
+    readings = bench.problem.samples.outputs
+    expected = readings - outputs_with(bench, points, coefficients[None], curve)[0]
+    acting = bench_with(bench, curve, coefficients)
+    found = acting.problem.samples.outputs - acting.simulated(points)[0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+    # A second curve comes on top of the first.
+    gone = bench_with(acting, curve, -coefficients)
+    left = readings - bench.simulated(points)[0]
+    np.testing.assert_allclose(gone.problem.samples.outputs - gone.simulated(points)[0], left, rtol=0, atol=1e-12)
+    assert np.max(np.abs(expected - left)) > 0.01
+
+
+def test_unknowns_beside_a_curve_make_up_for_what_they_can(bench):
+    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    curve = straight_along(bench, "force", "position", quantities(bench), 9)
+    # A stiffness that the plant has not: the unknowns lessen what it does, and cannot undo it.
+    acting = bench_with(bench, curve, 20.0 * curve.knots)
+    start, columns = bench.nominal[None], padded([bench.base_columns], len(bench.base_columns))
+    free, beside = (refit(b, start, columns, white, race=False) for b in (bench, acting))
+    at_once = white(acting.problem.samples.outputs - acting.simulated(start)[0])
+    assert free.cost[0] <= beside.cost[0] < float(at_once @ at_once)
 
 
 def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():

@@ -6,6 +6,7 @@ that place.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -209,6 +210,20 @@ def outputs_with(bench: Workbench, points, coefficients, curve: Curve):
     added = np.zeros((len(points), *shape[:2], len(bench.places)))
     added[:, 0, :, bench.places.index(curve.place)] = acting
     return bench.simulated(points, added)
+
+
+def bench_with(bench: Workbench, curve: Curve, coefficients: Float[np.ndarray, " piece"]) -> Workbench:
+    """Return the workbench with a curve that always acts at its place."""
+    acting = _acting(bench, curve, coefficients @ curve.pieces)
+    if curve.place in bench.places:
+        disturbances = bench.disturbances.copy()
+        disturbances[0, :, bench.places.index(curve.place)] += acting
+        return replace(bench, disturbances=disturbances)
+    # What a sensor adds may as well be taken from its readings.
+    samples = bench.problem.samples
+    readings = samples.outputs.copy()
+    readings[0, :, bench.problem.observed.index(curve.place)] -= acting
+    return replace(bench, problem=replace(bench.problem, samples=samples._replace(outputs=readings)))
 
 
 def _acting(bench: Workbench, curve: Curve, probes: Float[np.ndarray, "*batch time"]):

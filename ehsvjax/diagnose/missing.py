@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ehsvjax.diagnose.curves import (
     TIME,
     Curve,
+    bench_with,
     outputs_with,
     probe_at,
     quantity_unit,
@@ -22,7 +23,7 @@ from ehsvjax.diagnose.curves import (
 )
 from ehsvjax.diagnose.dependence import Dependence
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits, bounds_of, span, unexplained
+from ehsvjax.diagnose.refits import Refits, bounds_of, refit, span, unexplained
 from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.smoothing import Smooth, of_one_wave, smoothed
 from ehsvjax.diagnose.workbench import Workbench
@@ -31,9 +32,8 @@ from ehsvjax.diagnose.workbench import Workbench
 _SAMPLES_PER_KNOT = 50
 # Curves that are drawn with many pieces, of which one is returned.
 _FINALISTS = 3
-# Steps of the estimate of a curve, and of the unknowns beside it once it is smooth; dampings of each that are
-# simulated, and what the last one gains at most.
-_STEPS, _STEPS_BESIDE = 8, 4
+# Steps of the estimate of a curve, dampings of each that are simulated, and what the last one gains at most.
+_STEPS = 8
 _DAMPINGS = (0.0, 1e-4, 1e-2, 0.3, 10.0)
 _SETTLED, _SETTLED_SHARE = 0.1, 1e-3
 # Times that the least of equal terms is reweighted, and share of its height that counts as nothing in it.
@@ -207,11 +207,14 @@ def _drawn(bench: Workbench, final: Refits, white: Whitening, curve: Curve, poin
     beside = settled.left - float(np.sum((readings - settled.coefficients @ responses) ** 2))
     without = beside + float(readings @ readings)
     # What the record hardly tells may have gone so far that the smooth curve is another one once it is simulated.
-    whole = curve._replace(
-        values=smooth.coefficients[None] @ curve.values, pieces=smooth.coefficients[None] @ curve.pieces
-    )
-    left = _settled(bench, final, white, whole, settled.point, np.ones(1), _STEPS_BESIDE).left
+    left = _left_beside(bench_with(bench, curve, smooth.coefficients), final, white, settled.point)
     return _Drawn(settled, smooth, left, without - smooth.evidence + max(left - beside - smooth.left, 0.0))
+
+
+def _left_beside(acting: Workbench, final: Refits, white: Whitening, point) -> float:
+    """Return the sum of squares that the unknowns leave beside a curve that acts, refitted from two points."""
+    starts = np.stack([point, final.points[0]])
+    return float(np.min(refit(acting, starts, np.repeat(final.chosen, 2, axis=0), white, race=False).cost))
 
 
 def _cost(drawn: _Drawn) -> float:
@@ -234,16 +237,14 @@ def _alike(some: Sequence[_Drawn]) -> list[_Drawn]:
     return [d for d in some if d.cost <= best.cost + max(INSEPARABLE, lacking)]
 
 
-def _settled(
-    bench: Workbench, final: Refits, white: Whitening, curve: Curve, point, coefficients, steps=_STEPS
-) -> _Settled:
+def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, point, coefficients) -> _Settled:
     """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each."""
     measured = bench.problem.samples.outputs
     columns = final.chosen[0][final.chosen[0] >= 0]
     lower, upper = bounds_of(bench)
     r = white(measured - outputs_with(bench, point[None], coefficients[None], curve)[0])
     left = float(np.nan_to_num(r @ r, nan=np.inf))
-    for _ in range(steps):
+    for _ in range(_STEPS):
         rows = white(slopes_with(bench, point, columns, coefficients, curve))
         unknowns, pieces = rows[: len(columns)], rows[len(columns) :]
         points, curves = [], []
@@ -297,7 +298,7 @@ def _outside(pieces, known) -> Float[np.ndarray, "piece sample"]:
 
 def _free(curve: Curve, pieces, known) -> Float[np.ndarray, "line piece"]:
     """Return the straight lines along a curve that the unknowns make up for; no single wave has any."""
-    if len(curve.periods) or len(curve.pieces) == 1:
+    if len(curve.periods):
         return np.zeros((0, len(curve.pieces)))
     straight = np.stack([np.ones(len(curve.knots)), (curve.knots - curve.knots.mean()) / np.ptp(curve.knots)])
     combinations, sines = _angles(straight @ pieces, known)

@@ -61,7 +61,7 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
     if diagnosis.verdict != "adequate":
         repeating = _repeating(first.period, quantity_unit(diagnosis.fit.model, first.quantity))
         lines.append(
-            f"the residual depends on {first.quantity}{repeating} (seen from {first.place}): p = "
+            f"the residual depends on {first.quantity}{repeating} (seen from {first.place}): p "
             f"{_p(first.corrected)} for all {len(diagnosis.misfit.tests)} tests together"
         )
     return lines
@@ -157,4 +157,4 @@ def _spaced(unit: str) -> str:
 
 
 def _p(p: float) -> str:
-    return f"{p:.2g}" if p > 1e-12 else "0"
+    return f"= {p:.2g}" if p > 1e-12 else "< 1e-12"

@@ -48,6 +48,7 @@ class Workbench:
         scales: of each candidate.
         internal: what runs along the nominal model's signals.
         places: signals that can be disturbed by a series.
+        disturbances: `[record, time, place]` what is added to them in every simulation; nothing at first.
         column: name of an unknown -> its column; initial conditions are `name[record]`.
         nominal: `[parameter]` the point at which every effect is absent.
         differences: `[parameter]` of coordinates, for derivatives.
@@ -61,6 +62,7 @@ class Workbench:
     scales: dict[str, Scales]
     internal: Internal
     places: tuple[str, ...]
+    disturbances: Float[np.ndarray, "record time place"]
     column: dict[str, int]
     nominal: Float[np.ndarray, " parameter"]
     differences: Float[np.ndarray, " parameter"]
@@ -92,16 +94,15 @@ class Workbench:
         points: Float[np.ndarray, "individual parameter"],
         disturbances: Float[np.ndarray, "individual record time place"] | None = None,
     ) -> Float[np.ndarray, "individual record time signal"]:
-        """Return the outputs of each point, SI, with what is added to signals while they run."""
-        shape = (*self.problem.samples.inputs.shape[:2], len(self.places))
+        """Return the outputs of each point, SI, with what is added to signals while they run, beside what always is."""
         with jax.enable_x64(True):
             problem = cast(self.problem, jnp.float64)
 
         def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
             some = points[first : first + _ABREAST]
-            added = np.zeros((_ABREAST, *shape))
+            added = np.repeat(self.disturbances[None], _ABREAST, axis=0)
             if disturbances is not None:
-                added[: len(some)] = disturbances[first : first + _ABREAST]
+                added[: len(some)] += disturbances[first : first + _ABREAST]
             # The setting is that of a thread.
             with jax.enable_x64(True):
                 filled = jnp.asarray(_filled(some, _ABREAST))
@@ -192,7 +193,8 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
         if j not in own:
             one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
             nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
-    return Workbench(fit, full, problem, found, scales, internal, places, column, nominal, differences)
+    nothing = np.zeros((1, len(record), len(places)))
+    return Workbench(fit, full, problem, found, scales, internal, places, nothing, column, nominal, differences)
 
 
 def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
