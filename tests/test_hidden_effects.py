@@ -116,6 +116,16 @@ def test_two_effects_together_are_both_found(model, pair):
     assert set(pair) <= held(found), said
 
 
+@of_the_oscillator
+@pytest.mark.parametrize("seed", [6, 7])
+def test_what_makes_the_same_record_stays_one_group_beside_a_harmonic_force(seed):
+    # A frequency that was refitted without the constant force goes far to make up for it.
+    hidden = Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], ("harmonic_force", "constant_force"), seed)
+    found, _, said = diagnosed(hidden)
+    assert set(map(base, found.causes)) <= {"harmonic_force", "constant_force", "input_bias"}, said
+    assert held(found) == {"harmonic_force", "constant_force", "input_bias"}, said
+
+
 @of_the_servovalve
 def test_an_effect_that_the_bank_lacks_is_unexplained():
     found, _, said = diagnosed(Hidden("servovalve", "white", VARIANCE["servovalve"], ("unknown_spool_notch",), 3))

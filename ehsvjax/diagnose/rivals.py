@@ -91,10 +91,12 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     start = without(bench, final.points[0], own)
     current = refit_sets(trials, [start], [rest], white)
     found = _refitted_from(trials, current, own, rest, white)
-    if current.cost[0] > _FAR**2 * white.used.sum():
-        # Refits from so far off end in local minima, and what is like the effect there need not be like it here.
+    far = bool(current.cost[0] > _FAR**2 * white.used.sum())
+    if rest or far:
+        # Refits from far off end in local minima, and what is like the effect there need not be like it here. Nor do
+        # other effects always find back, a frequency for one, once they have gone to make up for what is not there.
         beside = refit(bench, start[None], current.chosen, white, iterations=1)
-        for candidate, refitted in _refitted_from(trials, beside, own, rest, white, anew=True).items():
+        for candidate, refitted in _refitted_from(trials, beside, own, rest, white, anew=True, thoroughly=far).items():
             found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
     rivals = [
         Rival(candidate, _cost(refitted) + PER_NUMBER * bench.numbers_of(candidate), refitted)
@@ -114,13 +116,19 @@ def _cost(refitted: Refits) -> float:
 
 
 def _refitted_from(
-    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, anew: bool = False
+    trials: Trials,
+    base: Refits,
+    own: int,
+    rest: tuple[int, ...],
+    white: Whitening,
+    anew: bool = False,
+    thoroughly: bool = False,
 ) -> dict[int, Refits]:
     """Return the refits of candidates that are, at a point without the effect, most like it."""
     bench = trials.bench
     screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, base, anew)
+    refitted = refit_screened(trials, close, rest, white, base, anew, thoroughly)
     return {s.candidate: refitted.best(k) for k, s in enumerate(close)}
 
 

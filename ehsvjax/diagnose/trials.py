@@ -71,18 +71,20 @@ def refit_sets(
     sets: Sequence[Sequence[int]],
     white: Whitening,
     race: bool = False,
+    anew: bool = False,
 ) -> Refits:
     """Refit each start with its effects, or from where these have been refitted before if that is better.
 
-    In a race, what falls far behind the best is given up.
+    In a race, what falls far behind the best is given up. Anew, only the starts count: what was reached before is
+    better than any start, and may be a local minimum.
     """
     bench = trials.bench
-    known = [trials.reached.get(frozenset(s)) for s in sets]
+    known = [None if anew else trials.reached.get(frozenset(s)) for s in sets]
     choices = [[start] if before is None else [start, before] for start, before in zip(starts, known, strict=True)]
     columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
     found = refit(bench, _best_of(bench, choices, white), columns, white, race=race)
     for point, cost, included in zip(found.points, found.cost, sets, strict=True):
-        if np.isfinite(cost):
+        if np.isfinite(cost) and not anew:
             trials.reached[frozenset(included)] = point
     return found
 
@@ -94,15 +96,17 @@ def refit_screened(
     white: Whitening,
     current: Refits,
     anew: bool = False,
+    thoroughly: bool = False,
 ) -> Refits:
     """Refit each screened candidate beside the effects that are there already, from a point without it.
 
-    From the start that promises most, or, where it must be looked for anew, from every start.
+    From the start that promises most, or, thoroughly, from every start.
     """
     choices = [_starts(trials.bench, s) for s in some]
     sets = [(*rest, s.candidate) for s in some]
-    starts = _best_led(trials.bench, choices, sets, white) if anew else _best_of(trials.bench, choices, white, current)
-    return refit_sets(trials, list(starts), sets, white, race=True)
+    bench = trials.bench
+    starts = _best_led(bench, choices, sets, white) if thoroughly else _best_of(bench, choices, white, current)
+    return refit_sets(trials, list(starts), sets, white, race=True, anew=anew)
 
 
 def refit_reshaped(
