@@ -124,11 +124,14 @@ def _refitted_from(
     anew: bool = False,
     thoroughly: bool = False,
 ) -> dict[int, Refits]:
-    """Return the refits of candidates that are, at a point without the effect, most like it."""
+    """Return the refits of candidates that are, at a point without the effect, most like it.
+
+    Anew and thoroughly as in `refit_screened`.
+    """
     bench = trials.bench
     screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, base, anew, thoroughly)
+    refitted = refit_screened(trials, close, rest, white, base, anew=anew, thoroughly=thoroughly)
     return {s.candidate: refitted.best(k) for k, s in enumerate(close)}
 
 

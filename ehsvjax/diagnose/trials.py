@@ -100,11 +100,11 @@ def refit_screened(
 ) -> Refits:
     """Refit each screened candidate beside the effects that are there already, from a point without it.
 
-    From the start that promises most, or, thoroughly, from every start.
+    From the start that promises most, or, thoroughly, from every start; anew as in `refit_sets`.
     """
-    choices = [_starts(trials.bench, s) for s in some]
-    sets = [(*rest, s.candidate) for s in some]
     bench = trials.bench
+    choices = [_starts(bench, s) for s in some]
+    sets = [(*rest, s.candidate) for s in some]
     starts = _best_led(bench, choices, sets, white) if thoroughly else _best_of(bench, choices, white, current)
     return refit_sets(trials, list(starts), sets, white, race=True, anew=anew)
 
