@@ -1,5 +1,6 @@
 """Refits: from many starts at once, each with unknowns of its own, by Levenberg-Marquardt on whitened residuals."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,9 +37,9 @@ class Refits(NamedTuple):
     chosen: Int[np.ndarray, "individual direction"]
     converged: Bool[np.ndarray, " individual"]
 
-    def best(self, i: int) -> "Refits":
-        """Return the refit of one start."""
-        return Refits(*(field[i : i + 1] for field in self))
+    def of(self, some: Sequence[int]) -> "Refits":
+        """Return the refits of some starts."""
+        return Refits(*(field[list(some)] for field in self))
 
 
 def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:

@@ -89,14 +89,15 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
     start = without(bench, final.points[0], own)
-    current = refit_sets(trials, [start], [rest], white)
-    found = _refitted_from(trials, current, own, rest, white)
+    current = refit_sets(trials, [[start]], [rest], white)
+    # Refits from far off end in local minima, and what is like the effect there need not be like it here.
     far = bool(current.cost[0] > _FAR**2 * white.used.sum())
+    found = {} if rest and not far else _refitted_from(trials, current, own, rest, white)
     if rest or far:
-        # Refits from far off end in local minima, and what is like the effect there need not be like it here. Nor do
-        # other effects always find back, a frequency for one, once they have gone to make up for what is not there.
+        # Other effects do not always find back, a frequency for one, once they have gone to make up for what is not
+        # there: they start where they are with the effect.
         beside = refit(bench, start[None], current.chosen, white, iterations=1)
-        for candidate, refitted in _refitted_from(trials, beside, own, rest, white, anew=True, thoroughly=far).items():
+        for candidate, refitted in _refitted_from(trials, beside, own, rest, white, thoroughly=far).items():
             found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
     rivals = [
         Rival(candidate, _cost(refitted) + PER_NUMBER * bench.numbers_of(candidate), refitted)
@@ -121,18 +122,17 @@ def _refitted_from(
     own: int,
     rest: tuple[int, ...],
     white: Whitening,
-    anew: bool = False,
     thoroughly: bool = False,
 ) -> dict[int, Refits]:
     """Return the refits of candidates that are, at a point without the effect, most like it.
 
-    Anew and thoroughly as in `refit_screened`.
+    Thoroughly as in `refit_screened`.
     """
     bench = trials.bench
     screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, base, anew=anew, thoroughly=thoroughly)
-    return {s.candidate: refitted.best(k) for k, s in enumerate(close)}
+    refitted = refit_screened(trials, close, rest, white, base, thoroughly=thoroughly)
+    return {s.candidate: refitted.of([k]) for k, s in enumerate(close)}
 
 
 def _close(ranked: Sequence[Screened], own: int) -> list[Screened]:

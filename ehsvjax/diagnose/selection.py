@@ -85,7 +85,7 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
     progress("simulating every candidate")
     trials = trials_of(bench, progress)
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
-    stages = [_look(trials, (), refit_sets(trials, [bench.nominal], [()], plain))]
+    stages = [_look(trials, (), refit_sets(trials, [[bench.nominal]], [()], plain))]
     while len(stages[-1].included) < _MOST_EFFECTS:
         found = _next_effect(trials, stages[-1])
         if found is None:
@@ -98,13 +98,14 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
         last = _look(trials, included, final)
         final = last.current
     while True:
-        nominal = refit_sets(trials, [stages[0].current.points[0]], [()], last.white)
+        nominal = refit_sets(trials, [[stages[0].current.points[0]]], [()], last.white)
         gains, needless = _gains(trials, included, final, nominal, last)
         if needless is None:
             break
         # What was added first can become needless by what was added later.
         rest = tuple(j for j in included if j != needless)
-        last = _look(trials, rest, refit_sets(trials, [without(bench, final.points[0], needless)], [rest], last.white))
+        start = without(bench, final.points[0], needless)
+        last = _look(trials, rest, refit_sets(trials, [[start]], [rest], last.white))
         included, final, rivals = rivals_of_all(trials, rest, last.current, last.white)
     return Selection(
         bench, trials.seen, included, final, nominal, last.white, (*stages[:-1], last), rivals, tuple(gains)
@@ -128,7 +129,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits) -> Stage:
     spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
     white = noise_outside(current.residual[0], measured, spanned)
     if white.coloured or len(white.noises) > 1:
-        current = refit_sets(trials, [current.points[0]], [included], white)
+        current = refit_sets(trials, [[current.points[0]]], [included], white)
         tried = responses_at(bench, current, included, white, trials.parts)
     else:
         # The variance of one output's white noise does not move the best fit.
@@ -161,9 +162,9 @@ def _next_effect(trials: Trials, stage: Stage) -> Stage | None:
         if without_form > _BANK_LACKS_IT * max(gain, required_gain(bench, stage.screening, candidate)):
             # A term of free form explains far more: the bank does not have what is missing.
             continue
-        if not _is_gain(trials, stage, refitted.best(chosen), candidate):
+        if not _is_gain(trials, stage, refitted.of([chosen]), candidate):
             continue
-        best = _look(trials, (*stage.included, candidate), refitted.best(chosen))
+        best = _look(trials, (*stage.included, candidate), refitted.of([chosen]))
         if not _leaves_something(best):
             break
         reshaped = refit_reshaped(trials, best.current, best.included, candidate, best.white)
@@ -199,7 +200,7 @@ def _is_gain(trials: Trials, stage: Stage, extended: Refits, candidate: int) -> 
     if not own.coloured and not stage.white.coloured:
         return True
     both = refit_sets(
-        trials, [stage.current.points[0], extended.points[0]], [stage.included, (*stage.included, candidate)], own
+        trials, [[stage.current.points[0]], [extended.points[0]]], [stage.included, (*stage.included, candidate)], own
     )
     return bool(both.cost[0] - both.cost[1] > required)
 
@@ -210,7 +211,7 @@ def _gains(trials: Trials, included, final: Refits, nominal: Refits, last: Stage
     for i in included:
         rest = tuple(j for j in included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
-        gain = float(refit_sets(trials, [start], [rest], last.white).cost[0] - final.cost[0])
+        gain = float(refit_sets(trials, [[start]], [rest], last.white).cost[0] - final.cost[0])
         gains.append(gain)
         spare[i] = gain - required_gain(trials.bench, last.screening, i)
     least = min(spare, key=lambda i: spare[i], default=None)

@@ -67,24 +67,24 @@ def fits(bench: Workbench, included: Sequence[int]) -> bool:
 
 def refit_sets(
     trials: Trials,
-    starts: Sequence[Float[np.ndarray, " parameter"]],
+    starts: Sequence[Sequence[Float[np.ndarray, " parameter"]]],
     sets: Sequence[Sequence[int]],
     white: Whitening,
     race: bool = False,
-    anew: bool = False,
 ) -> Refits:
-    """Refit each start with its effects, or from where these have been refitted before if that is better.
+    """Refit each set of effects from each of its starts, and from where it has been refitted before; return the best.
 
-    In a race, what falls far behind the best is given up. Anew, only the starts count: what was reached before is
-    better than any start, and may be a local minimum.
+    Where it was before is better than any start, and may yet be a local minimum: all are refitted. In a race, what
+    falls far behind the best is given up.
     """
     bench = trials.bench
-    known = [None if anew else trials.reached.get(frozenset(s)) for s in sets]
-    choices = [[start] if before is None else [start, before] for start, before in zip(starts, known, strict=True)]
+    choices = [_different([*some, *_before(trials, s)]) for some, s in zip(starts, sets, strict=True)]
+    of = np.repeat(np.arange(len(sets)), [len(choice) for choice in choices])
     columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
-    found = refit(bench, _best_of(bench, choices, white), columns, white, race=race)
+    led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], white, race=race)
+    found = led.of([int(np.argmin(np.where(of == i, led.cost, np.inf))) for i in range(len(sets))])
     for point, cost, included in zip(found.points, found.cost, sets, strict=True):
-        if np.isfinite(cost) and not anew:
+        if np.isfinite(cost):
             trials.reached[frozenset(included)] = point
     return found
 
@@ -95,18 +95,17 @@ def refit_screened(
     rest: Sequence[int],
     white: Whitening,
     current: Refits,
-    anew: bool = False,
     thoroughly: bool = False,
 ) -> Refits:
     """Refit each screened candidate beside the effects that are there already, from a point without it.
 
-    From the start that promises most, or, thoroughly, from every start; anew as in `refit_sets`.
+    From the start that promises most, or, thoroughly, from every start.
     """
     bench = trials.bench
-    choices = [_starts(bench, s) for s in some]
-    sets = [(*rest, s.candidate) for s in some]
-    starts = _best_led(bench, choices, sets, white) if thoroughly else _best_of(bench, choices, white, current)
-    return refit_sets(trials, list(starts), sets, white, race=True, anew=anew)
+    starts = [_starts(bench, s) for s in some]
+    if not thoroughly:
+        starts = [[start] for start in _most_promising(bench, starts, white, current)]
+    return refit_sets(trials, starts, [(*rest, s.candidate) for s in some], white, race=True)
 
 
 def refit_reshaped(
@@ -130,7 +129,7 @@ def refit_reshaped(
         return current
     columns = padded([bench.columns_with(included)] * len(starts), most_unknowns(bench))
     found = refit(bench, np.stack(starts), columns, white)
-    best = found.best(int(np.argmin(found.cost)))
+    best = found.of([int(np.argmin(found.cost))])
     if not best.cost[0] < current.cost[0]:
         return current
     trials.reached[frozenset(included)] = best.points[0]
@@ -147,31 +146,28 @@ def without(
     return point
 
 
-def _best_of(
-    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], white: Whitening, current: Refits | None = None
+def _before(trials: Trials, included: Sequence[int]) -> list[Float[np.ndarray, " parameter"]]:
+    """Return where a set of effects has been refitted before, if it has."""
+    point = trials.reached.get(frozenset(included))
+    return [] if point is None else [point]
+
+
+def _different(points: Sequence[Float[np.ndarray, " parameter"]]) -> list[Float[np.ndarray, " parameter"]]:
+    return list({point.tobytes(): point for point in points}.values())
+
+
+def _most_promising(
+    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], white: Whitening, current: Refits
 ) -> Float[np.ndarray, "individual parameter"]:
-    """Return of each list of points the one that fits best, or would after a linear refit of what `current` has."""
-    if all(len(choice) == 1 for choice in choices):
-        return np.stack([choice[0] for choice in choices])
+    """Return of each list of points the one that would fit best after a linear refit of what `current` has."""
     points = np.concatenate([np.stack(choice) for choice in choices])
     r = white(bench.problem.samples.outputs - bench.simulated(points))
-    if current is not None:
-        known = span(white(current.slopes[0]))
-        r = r - (r @ known) @ known.T
+    known = span(white(current.slopes[0]))
+    r = r - (r @ known) @ known.T
     cost = np.sum(r**2, axis=1)
     cost = np.where(np.isfinite(cost), cost, np.inf)
     edges = np.cumsum([0, *(len(choice) for choice in choices)])
     return np.stack([points[a + np.argmin(cost[a:b])] for a, b in itertools.pairwise(edges)])
-
-
-def _best_led(
-    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], sets: Sequence[Sequence[int]], white: Whitening
-) -> Float[np.ndarray, "individual parameter"]:
-    """Return of each list of points where the one has led whose refit with a set of effects fits best."""
-    of = np.repeat(np.arange(len(choices)), [len(choice) for choice in choices])
-    columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
-    led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], white)
-    return np.stack([led.points[np.argmin(np.where(of == i, led.cost, np.inf))] for i in range(len(choices))])
 
 
 def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " parameter"]]:

@@ -26,8 +26,8 @@ from ehsvjax.unknowns import problem_of
 
 # Kinds of signals at which a missing term is looked for.
 PLACES = ("force", "load", "opening", "supply", "damping", "displacement")
-# Simulated side by side.
-_ABREAST = 16
+# Simulated side by side: so few that a handful of points keeps all cores busy.
+_ABREAST = 8
 # Of coordinates, for derivatives. An effect's size may count so little in its own that rounding would drown it.
 _DIFFERENCE, _DIFFERENCE_OF_SIZE = 1e-6, 1e-4
 # Of the outputs: less is rounding.
