@@ -33,12 +33,12 @@ from tqdm import tqdm
 import ehsvjax
 from ehsvjax.diagnose import Diagnosis, diagnose
 from ehsvjax.diagnose.missing import MissingTerm
+from tests.hidden_oracle import SEPARABLE, oracle, worth_each
 from tests.hidden_plants import effect_sizes
-from tests.hidden_records import TRUTH, Hidden, Made, oracle, records, true_term, worth_each
+from tests.hidden_records import TRUTH, Hidden, Made, records, true_term
 
 matplotlib.use("Agg")
 
-SEPARABLE = 5.0**2
 VARIANCES = {"servovalve": (1e-8, 1e-7, 1e-5), "van_der_pol": (0.001, 0.01, 0.05)}
 
 

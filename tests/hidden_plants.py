@@ -133,7 +133,7 @@ def servovalve_with(
     sample_period: float,
     *,
     noise: np.ndarray | None = None,
-    initial_position: float = 0.0,
+    initial_position: float | np.ndarray = 0.0,
     fine_step: float = SERVOVALVE_STEP,
     **valve: float,
 ) -> dict[str, np.ndarray]:

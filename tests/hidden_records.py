@@ -1,15 +1,12 @@
-"""Records with hidden effects: excitation, sizes drawn at random, noise, and what the plant says could be known.
+"""Records with hidden effects: excitation, sizes drawn at random, noise.
 
 Used by tests and by benchmarks/diagnosis.py; the plants are those of hidden_plants.py.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.signal import lfilter
 
 from tests.hidden_plants import Valve, effect_sizes, held_levels, servovalve_with, van_der_pol_with
@@ -21,32 +18,8 @@ TRUTH = {
     "servovalve": {name: getattr(Valve(), name) for name in _IDENTIFIED},
     "van_der_pol": {"alpha": 0.96, "gamma": 1.23},
 }
-# Another effect that makes the same record with other parameters, whatever its size: gamma*(1 - x^2/c^2) - d is
-# g*(1 - x^2/k^2) with g = gamma - d; a stiffer spring is a smaller input; an input's bias is a constant force. What a
-# pump's resistance takes from the supply at a flow A*v, a viscous friction of A^2 times that takes from the load.
-EXACTLY_ALIKE = {
-    "servovalve": {
-        "null_bias": "asymmetric_dead_zone",
-        "asymmetric_dead_zone": "null_bias",
-        "supply_droop": "viscous_friction",
-        "viscous_friction": "supply_droop",
-    },
-    "van_der_pol": {
-        "linear_damping": "damping_threshold",
-        "damping_threshold": "linear_damping",
-        "input_gain": "linear_stiffness",
-        "constant_force": "input_bias",
-    },
-}
-# Sizes that are larger than plausible, but which plausible ones of other effects may look like.
-_IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -1e4}))
 # Of quantised noise, in deviations of the noise: nothing is hidden in a record whose readings are as coarse as that.
 COARSEST = 2.0
-# Rivals of the oscillator's that are refitted in the place of what is hidden.
-_RIVALS_REFITTED = 3
-_HARMONIC = ("harmonic_force", "parametric_excitation")
-# Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
-_REFIT_STEP = 0.02
 # Sizes of these are never negative.
 ONE_SIDED = frozenset(
     """
@@ -114,75 +87,6 @@ def plant(model: str, effects: Sequence[Mapping], commands, period, noise=None) 
     return position if noise is None else position + noise
 
 
-class Nominal(NamedTuple):
-    """A plant without any effect: its position [time], and orthonormal directions [time, direction].
-
-    The directions are those of its parameters and initial conditions: what lies outside them no refit could do, to
-    first order.
-    """
-
-    position: np.ndarray
-    basis: np.ndarray
-
-    def outside(self, position: np.ndarray) -> np.ndarray:
-        """Return what a position [time] has that a refit has not."""
-        change = position - self.position
-        return change - self.basis @ (self.basis.T @ change)
-
-
-@functools.cache
-def nominal(model: str, seed: int, samples: int) -> Nominal:
-    """Return the plant without any effect under an excitation."""
-    command, period = excitation(model, seed)
-    simulate = servovalve_with if model == "servovalve" else van_der_pol_with
-
-    def positions(changed):
-        """Simulate with each of some parameters changed in turn; those of a filter are not taken side by side."""
-        count = len(next(iter(changed.values()), [0]))
-        return simulate([{}] * count, np.tile(command[:samples], (count, 1)), period, **changed)["position"]
-
-    truth = TRUTH[model]
-    alone = [name for name in truth if name in ("damping_ratio", "natural_frequency")]
-    together = [name for name in truth if name not in alone]
-    sides = {name: truth[name] * (1.0 + 1e-5 * np.eye(len(together) + 1)[i + 1]) for i, name in enumerate(together)}
-    plain, *moved = positions(sides)
-    others = [{name: truth[name] * (1.0 + 1e-5)} for name in alone]
-    others += [{"initial_position": 1e-6}] if model == "servovalve" else [{"initial": x} for x in 1e-5 * np.eye(2)]
-    moved += [simulate([{}], command[None, :samples], period, **other)["position"][0] for other in others]
-    return Nominal(plain, np.linalg.qr((np.array(moved) - plain).T)[0])
-
-
-@functools.cache
-def library(model: str, seed: int, samples: int) -> dict[str, np.ndarray]:
-    """Return what a plant could do instead of an effect that is hidden: by its name [variant, time], of unit length.
-
-    Each effect at small, medium and large sizes, and a few implausible ones, outside what a refit could do.
-    """
-    command, period = excitation(model, seed)
-    ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
-    variants = [
-        (name, {k: sign**(i == 0) * _between(low, high, share) for i, (k, (low, high)) in enumerate(numbers.items())})
-        for name, numbers in ranges.items()
-        for share, sign in ((0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (0.5, -1.0))
-        if sign > 0 or name not in ONE_SIDED
-    ]  # fmt: skip
-    variants += [(name, sizes) for name, sizes in _IMPLAUSIBLE if name in ranges]
-    y = plant(
-        model, [{name: sizes} for name, sizes in variants], np.tile(command[:samples], (len(variants), 1)), period
-    )
-    without = nominal(model, seed, samples)
-    directions: dict[str, list[np.ndarray]] = {}
-    for (name, _), row in zip(variants, y, strict=True):
-        left = without.outside(row)
-        directions.setdefault(name, []).append(left / max(np.linalg.norm(left), 1e-300))
-    return {name: np.array(rows) for name, rows in directions.items()}
-
-
-def _between(low: float, high: float, share: float) -> float:
-    """Return the size at a share of the way between plausible ones, logarithmic as they are drawn."""
-    return low * (high / low) ** share if low > 0 else low + share * (high - low)
-
-
 class Made(NamedTuple):
     """A record: time s, command, the measured position and that without noise, `[time]`, the sizes, the excitation."""
 
@@ -216,143 +120,6 @@ def records(hidden: Sequence[Hidden], samples: int | None = None) -> list[Made]:
         time = np.arange(len(position)) * period
         made.append(Made(time, commands[i], position, clean[i], effects[i], seeds[i]))
     return made
-
-
-def left_by_refit(hidden: Hidden, made: Made) -> np.ndarray:
-    """Return what a refit of the plant without any effect leaves of the position without noise, [time].
-
-    To first order for the servovalve. A refit of the oscillator moves its phase, which is far from linear: by least
-    squares in the plant.
-    """
-    if hidden.model == "servovalve":
-        return nominal(hidden.model, made.excitation, len(made.time)).outside(made.clean)
-    return _left_by_oscillator(made, {})
-
-
-def _left_by_oscillator(made: Made, beside: Mapping[str, Mapping[str, float]]) -> np.ndarray:
-    """Return what the oscillator with these effects leaves of the position without noise, [time], all refitted."""
-    truth, period = TRUTH["van_der_pol"], excitation("van_der_pol", 0)[1]
-    numbers = [(name, number) for name, sizes in beside.items() for number in sizes]
-    sizes = [beside[name][number] for name, number in numbers]
-    start = np.array([truth["alpha"], truth["gamma"], 0.0, 0.0, *sizes])
-    lowest = [-np.inf] * 4 + [0.0 if name in ONE_SIDED else -np.inf for name, _ in numbers]
-    steps = np.array([1e-5] * 4 + [1e-4 * abs(size) for size in sizes])
-
-    def positions(points):
-        effects = [{name: {} for name in beside} for _ in points]
-        for effect, point in zip(effects, points, strict=True):
-            for (name, number), value in zip(numbers, point[4:], strict=True):
-                effect[name][number] = value
-        commands = np.tile(made.command, (len(points), 1))
-        alpha, gamma, initial = points[:, 0], points[:, 1], points[:, 2:4]
-        return van_der_pol_with(effects, commands, period, alpha, gamma, initial, fine_step=_REFIT_STEP)["position"]
-
-    def left(point):
-        return made.clean - positions(point[None])[0]
-
-    def slopes(point):
-        y = positions(np.concatenate([point[None], point + np.diag(steps)]))
-        return -((y[1:] - y[0]) / steps[:, None]).T
-
-    # A step too far overflows; the next is shorter.
-    with np.errstate(over="ignore", invalid="ignore"):
-        found = least_squares(left, start, slopes, bounds=(lowest, np.inf), x_scale="jac", ftol=1e-4, max_nfev=50)
-    return found.fun
-
-
-def worth(hidden: Hidden, made: Made) -> float:
-    """Return the noise variances that the effects are worth beside a refit of what is known."""
-    return float(np.sum(left_by_refit(hidden, made) ** 2)) / hidden.variance
-
-
-class Oracle(NamedTuple):
-    """What could be known of what is hidden, in noise variances.
-
-    Attributes:
-        worth: of it beside a refit of what is known.
-        deficit: by which the best rival is worse, to first order for the servovalve; 0 for a rival that makes the
-            same record.
-        rival: that rival: one other effect, for two effects together any one; for an effect that is in no bank two.
-
-    """
-
-    worth: float
-    deficit: float
-    rival: str
-
-
-def oracle(hidden: Hidden, made: Made) -> Oracle:
-    """Return what could be known of the effects that a record hides: one or two, or one that is in no bank."""
-    left = left_by_refit(hidden, made)
-    size = float(left @ left) / hidden.variance
-    unit = left / max(np.linalg.norm(left), 1e-300)
-    unknown = hidden.names[0].startswith("unknown")
-    if len(hidden.names) == 1 and _is_noise(hidden.names[0], hidden, made):
-        return Oracle(size, 0.0, "quantised noise")
-    if len(hidden.names) == 1 and hidden.names[0] in EXACTLY_ALIKE[hidden.model]:
-        return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][hidden.names[0]])
-    every = library(hidden.model, made.excitation, len(made.time))
-    if unknown:
-        rivals = {pair: _share_of(unit, *(every[other] for other in pair)) for pair in combinations(every, 2)}
-    else:
-        rivals = {(other,): float(np.max((every[other] @ unit) ** 2)) for other in every if hidden.names != (other,)}
-    best = sorted(rivals, key=lambda names: -rivals[names])
-    deficits = {names: size * (1.0 - rivals[names]) for names in best}
-    if hidden.model == "van_der_pol":
-        # What is to make up for something else may have to be large, or of a frequency that the library lacks.
-        tried = dict.fromkeys([*best[:_RIVALS_REFITTED], *((name,) for name in _HARMONIC if (name,) in deficits)])
-        deficits |= {names: min(deficits[names], _refitted(hidden, made, names)) for names in tried}
-    rival = min(deficits, key=lambda names: deficits[names])
-    return Oracle(size, deficits[rival], " and ".join(rival))
-
-
-def _is_noise(name: str, hidden: Hidden, made: Made) -> bool:
-    """Whether an effect is a lattice of readings as fine as that of quantised noise."""
-    return name == "sensor_quantisation" and made.sizes[name]["step"] < COARSEST * hidden.variance**0.5
-
-
-def _refitted(hidden: Hidden, made: Made, names: Sequence[str]) -> float:
-    """Return the noise variances that the oscillator with other effects leaves of a record."""
-    ranges = effect_sizes(hidden.model)
-    middle = {name: {k: _between(low, high, 0.5) for k, (low, high) in ranges[name].items()} for name in names}
-    left = _left_by_oscillator(made, middle)
-    return float(left @ left) / hidden.variance
-
-
-def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
-    """Return the share of a direction that two effects take together, each at the best of its sizes."""
-    a, b, c = (first @ unit)[:, None], (second @ unit)[None, :], first @ second.T
-    return float(np.max((a**2 + b**2 - 2.0 * a * b * c) / np.maximum(1.0 - c**2, 1e-6)))
-
-
-def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
-    """Return the noise variances that each of several effects is worth beside the others; None with random ones.
-
-    To first order for the servovalve, by least squares for the oscillator; none for what is but noise.
-    """
-    if "process_noise" in hidden.names:
-        return None
-    if hidden.model == "van_der_pol":
-        left = [
-            _left_by_oscillator(made, {n: sizes for n, sizes in made.sizes.items() if n != name})
-            for name in hidden.names
-        ]
-        return tuple(float(r @ r) / hidden.variance for r in left)
-    without = nominal(hidden.model, made.excitation, len(made.time))
-    alone = plant(
-        hidden.model,
-        [{name: made.sizes[name]} for name in hidden.names],
-        np.tile(made.command, (len(hidden.names), 1)),
-        excitation(hidden.model, 0)[1],
-    )
-    changes = alone - without.position
-    worths = []
-    for i in range(len(changes)):
-        others = np.concatenate([without.basis, np.delete(changes, i, axis=0).T], axis=1)
-        q = np.linalg.qr(others)[0]
-        left = changes[i] - q @ (q.T @ changes[i])
-        worths.append(0.0 if _is_noise(hidden.names[i], hidden, made) else float(left @ left) / hidden.variance)
-    return tuple(worths)
 
 
 def true_term(hidden: Hidden, made: Made) -> tuple[str, np.ndarray, np.ndarray]:

@@ -13,8 +13,9 @@ import pytest
 
 import ehsvjax
 from ehsvjax.diagnose import Diagnosis, diagnose
+from tests.hidden_oracle import worth
 from tests.hidden_plants import effect_sizes
-from tests.hidden_records import Hidden, records, worth
+from tests.hidden_records import Hidden, records
 
 # A fresh seed each time; set the variable to repeat a run.
 FRESH = int(os.environ.get("EHSVJAX_SEED", secrets.randbelow(2**31)))

@@ -1,0 +1,283 @@
+"""What could be known of hidden effects at all, as the plants themselves say: their worth, and that of their rivals.
+
+Used by tests and by benchmarks/diagnosis.py. A servovalve is taken to first order where that is enough; the
+oscillator, whose phase any refit moves, is refitted by least squares in the plant.
+"""
+
+import functools
+from collections.abc import Mapping
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from tests.hidden_plants import effect_sizes, servovalve_with, van_der_pol_with
+from tests.hidden_records import COARSEST, ONE_SIDED, TRUTH, Hidden, Made, excitation, plant
+
+SEPARABLE = 5.0**2
+"""Noise variances by which a fit has to be worse for a record to tell."""
+# Another effect that makes the same record with other parameters, whatever its size: gamma*(1 - x^2/c^2) - d is
+# g*(1 - x^2/k^2) with g = gamma - d; a stiffer spring is a smaller input; an input's bias is a constant force. What a
+# pump's resistance takes from the supply at a flow A*v, a viscous friction of A^2 times that takes from the load.
+EXACTLY_ALIKE = {
+    "servovalve": {
+        "null_bias": "asymmetric_dead_zone",
+        "asymmetric_dead_zone": "null_bias",
+        "supply_droop": "viscous_friction",
+        "viscous_friction": "supply_droop",
+    },
+    "van_der_pol": {
+        "linear_damping": "damping_threshold",
+        "damping_threshold": "linear_damping",
+        "input_gain": "linear_stiffness",
+        "constant_force": "input_bias",
+    },
+}
+# Sizes that are larger than plausible, but which plausible ones of other effects may look like.
+_IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -1e4}))
+# Shares of a servovalve's worth below which what is left to first order is not trusted: it is refitted in the plant.
+_OF_FIRST_ORDER = 0.03
+# Rivals that are refitted in the place of what is hidden.
+_RIVALS_REFITTED = 3
+_HARMONIC = ("harmonic_force", "parametric_excitation")
+# Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
+_REFIT_STEP = 0.02
+# Of a filter, which the plant does not take side by side.
+_ALONE = ("damping_ratio", "natural_frequency")
+_INITIAL_CONDITIONS = {"servovalve": 1, "van_der_pol": 2}
+# Differences for derivatives: share of a parameter, initial condition, share of an effect's number.
+_OF_PARAMETER, _OF_INITIAL, _OF_SIZE = 1e-5, {"servovalve": 1e-6, "van_der_pol": 1e-5}, 1e-4
+
+
+class Oracle(NamedTuple):
+    """What could be known of what is hidden, in noise variances.
+
+    Attributes:
+        worth: of it beside a refit of what is known.
+        deficit: by which the best rival is worse; 0 for a rival that makes the same record.
+        rival: that rival: one other effect, for two effects together any one; for an effect that is in no bank two.
+
+    """
+
+    worth: float
+    deficit: float
+    rival: str
+
+
+def oracle(hidden: Hidden, made: Made) -> Oracle:
+    """Return what could be known of the effects that a record hides: one or two, or one that is in no bank."""
+    left = _left_by_nothing(hidden, made)
+    size = float(left @ left) / hidden.variance
+    unit = left / max(np.linalg.norm(left), 1e-300)
+    if len(hidden.names) == 1:
+        (name,) = hidden.names
+        if _is_noise(name, hidden, made):
+            return Oracle(size, 0.0, "quantised noise")
+        if name in EXACTLY_ALIKE[hidden.model]:
+            return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][name])
+    every = library(hidden.model, made.excitation, len(made.time))
+    if hidden.names[0].startswith("unknown"):
+        rivals = {pair: _share_of(unit, *(every[other] for other in pair)) for pair in combinations(every, 2)}
+    else:
+        rivals = {(other,): float(np.max((every[other] @ unit) ** 2)) for other in every if hidden.names != (other,)}
+    best = sorted(rivals, key=lambda names: -rivals[names])
+    deficits = {names: size * (1.0 - rivals[names]) for names in best}
+    doubtful = best[:_RIVALS_REFITTED]
+    if hidden.model == "van_der_pol":
+        # What is to make up for something else may have to be large, or of a frequency that the library lacks.
+        doubtful = list(dict.fromkeys([*doubtful, *((name,) for name in _HARMONIC if (name,) in deficits)]))
+    elif deficits[best[0]] > SEPARABLE:
+        doubtful = [names for names in doubtful if deficits[names] < _OF_FIRST_ORDER * size]
+    else:
+        doubtful = []
+    for names in doubtful:
+        left = left_beside(hidden.model, made, {name: _nearest(hidden.model, every, name, unit) for name in names})
+        deficits[names] = min(deficits[names], float(left @ left) / hidden.variance)
+    rival = min(deficits, key=lambda names: deficits[names])
+    return Oracle(size, deficits[rival], " and ".join(rival))
+
+
+def worth(hidden: Hidden, made: Made) -> float:
+    """Return the noise variances that the effects are worth beside a refit of what is known."""
+    return float(np.sum(_left_by_nothing(hidden, made) ** 2)) / hidden.variance
+
+
+def worth_each(hidden: Hidden, made: Made) -> tuple[float, ...] | None:
+    """Return the noise variances that each of several effects is worth beside the others; None with random ones."""
+    if "process_noise" in hidden.names:
+        return None
+
+    def refitted(name):
+        left = left_beside(hidden.model, made, {n: sizes for n, sizes in made.sizes.items() if n != name})
+        return float(left @ left) / hidden.variance
+
+    if hidden.model == "van_der_pol":
+        return tuple(refitted(name) for name in hidden.names)
+    doubted = _OF_FIRST_ORDER * worth(hidden, made)
+    found = []
+    for name, to_first_order in zip(hidden.names, _worth_to_first_order(hidden, made), strict=True):
+        if _is_noise(name, hidden, made):
+            found.append(0.0)
+        elif SEPARABLE < to_first_order < doubted:
+            found.append(refitted(name))
+        else:
+            found.append(to_first_order)
+    return tuple(found)
+
+
+def left_beside(model: str, made: Made, beside: Mapping[str, Mapping[str, float]]) -> np.ndarray:
+    """Return what the plant with some effects leaves of the position without noise, [time].
+
+    All refitted by least squares: the parameters that are identified, initial conditions and the effects' numbers.
+    """
+    parameters = list(TRUTH[model].values())
+    numbers = [(name, number) for name, sizes in beside.items() for number in sizes]
+    sizes = [beside[name][number] for name, number in numbers]
+    initial = _INITIAL_CONDITIONS[model]
+    start = np.array([*parameters, *[0.0] * initial, *sizes])
+    least = 0.0 if model == "servovalve" else -np.inf
+    lowest = [least] * len(parameters) + [-np.inf] * initial
+    lowest += [0.0 if name in ONE_SIDED else -np.inf for name, _ in numbers]
+    changes = (_OF_PARAMETER * np.abs(parameters), [_OF_INITIAL[model]] * initial, _OF_SIZE * np.abs(sizes))
+    steps = np.concatenate(changes)
+
+    def positions(points):
+        effects = [{name: {} for name in beside} for _ in points]
+        for effect, point in zip(effects, points, strict=True):
+            for (name, number), value in zip(numbers, point[len(parameters) + initial :], strict=True):
+                effect[name][number] = value
+        return _positions(model, made.command, points[:, : len(parameters) + initial], effects)
+
+    def left(point):
+        return made.clean - positions(point[None])[0]
+
+    def slopes(point):
+        y = positions(np.concatenate([point[None], point + np.diag(steps)]))
+        return -((y[1:] - y[0]) / steps[:, None]).T
+
+    # A step too far overflows; the next is shorter.
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = least_squares(left, start, slopes, bounds=(lowest, np.inf), x_scale="jac", ftol=1e-4, max_nfev=50)
+    return found.fun
+
+
+def _positions(model: str, command, points, effects) -> np.ndarray:
+    """Return the positions [point, time] of plants whose parameters and initial conditions are [point, number]."""
+    commands, period = np.tile(command, (len(points), 1)), excitation(model, 0)[1]
+    if model == "van_der_pol":
+        alpha, gamma, initial = points[:, 0], points[:, 1], points[:, 2:]
+        return van_der_pol_with(effects, commands, period, alpha, gamma, initial, fine_step=_REFIT_STEP)["position"]
+    columns = {name: points[:, i] for i, name in enumerate([*TRUTH[model], "initial_position"])}
+    found = np.empty_like(commands)
+    filters = np.stack([columns[name] for name in _ALONE], axis=1)
+    for one in np.unique(filters, axis=0):
+        at = np.flatnonzero((filters == one).all(axis=1))
+        valve = {name: column[at] for name, column in columns.items()} | dict(zip(_ALONE, one, strict=True))
+        found[at] = servovalve_with([effects[i] for i in at], commands[at], period, **valve)["position"]
+    return found
+
+
+class Nominal(NamedTuple):
+    """A servovalve without any effect: its position [time], and orthonormal directions [time, direction].
+
+    The directions are those of its parameters and initial conditions: what lies outside them no refit could do, to
+    first order.
+    """
+
+    position: np.ndarray
+    basis: np.ndarray
+
+    def outside(self, position: np.ndarray) -> np.ndarray:
+        """Return what a position [time] has that a refit has not."""
+        change = position - self.position
+        return change - self.basis @ (self.basis.T @ change)
+
+
+@functools.cache
+def nominal(model: str, seed: int, samples: int) -> Nominal:
+    """Return the plant without any effect under an excitation."""
+    command = excitation(model, seed)[0][:samples]
+    initial = _INITIAL_CONDITIONS[model]
+    plain = np.array([*TRUTH[model].values(), *[0.0] * initial])
+    moved = plain + np.diag([*(_OF_PARAMETER * plain[:-initial]), *[_OF_INITIAL[model]] * initial])
+    y = _positions(model, command, np.concatenate([plain[None], moved]), [{}] * (1 + len(moved)))
+    return Nominal(y[0], np.linalg.qr((y[1:] - y[0]).T)[0])
+
+
+@functools.cache
+def library(model: str, seed: int, samples: int) -> dict[str, np.ndarray]:
+    """Return what a plant could do instead of an effect that is hidden: by its name [variant, time], of unit length.
+
+    Each effect at small, medium and large sizes, and a few implausible ones, outside what a refit could do.
+    """
+    command, period = excitation(model, seed)
+    every = [(name, sizes) for name, some in _variants(model).items() for sizes in some]
+    y = plant(model, [{name: sizes} for name, sizes in every], np.tile(command[:samples], (len(every), 1)), period)
+    without = nominal(model, seed, samples)
+    directions: dict[str, list[np.ndarray]] = {}
+    for (name, _), row in zip(every, y, strict=True):
+        left = without.outside(row)
+        directions.setdefault(name, []).append(left / max(np.linalg.norm(left), 1e-300))
+    return {name: np.array(rows) for name, rows in directions.items()}
+
+
+def _variants(model: str) -> dict[str, list[dict[str, float]]]:
+    """Return small, medium and large sizes of each effect of a bank, and medium ones of the other sign."""
+    ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
+    found = {
+        name: [
+            {k: sign ** (i == 0) * _between(low, high, share) for i, (k, (low, high)) in enumerate(numbers.items())}
+            for share, sign in ((0.1, 1.0), (0.5, 1.0), (0.9, 1.0), (0.5, -1.0))
+            if sign > 0 or name not in ONE_SIDED
+        ]
+        for name, numbers in ranges.items()
+    }
+    for name, sizes in _IMPLAUSIBLE:
+        if name in found:
+            found[name].append(sizes)
+    return found
+
+
+def _nearest(model: str, every: Mapping[str, np.ndarray], name: str, unit: np.ndarray) -> dict[str, float]:
+    """Return the sizes of an effect that are most like a direction: from there it is refitted."""
+    if model == "van_der_pol":
+        return _variants(model)[name][1]
+    return _variants(model)[name][int(np.argmax(every[name] @ unit))]
+
+
+def _between(low: float, high: float, share: float) -> float:
+    """Return the size at a share of the way between plausible ones, logarithmic as they are drawn."""
+    return low * (high / low) ** share if low > 0 else low + share * (high - low)
+
+
+def _left_by_nothing(hidden: Hidden, made: Made) -> np.ndarray:
+    """Return what a refit of the plant without any effect leaves of the position without noise, [time]."""
+    if hidden.model == "servovalve":
+        return nominal(hidden.model, made.excitation, len(made.time)).outside(made.clean)
+    return left_beside(hidden.model, made, {})
+
+
+def _is_noise(name: str, hidden: Hidden, made: Made) -> bool:
+    """Whether an effect is a lattice of readings as fine as that of quantised noise."""
+    return name == "sensor_quantisation" and made.sizes[name]["step"] < COARSEST * hidden.variance**0.5
+
+
+def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
+    """Return the share of a direction that two effects take together, each at the best of its sizes."""
+    a, b, c = (first @ unit)[:, None], (second @ unit)[None, :], first @ second.T
+    return float(np.max((a**2 + b**2 - 2.0 * a * b * c) / np.maximum(1.0 - c**2, 1e-6)))
+
+
+def _worth_to_first_order(hidden: Hidden, made: Made) -> list[float]:
+    """Return the noise variances that each of a servovalve's effects is worth beside the others, to first order."""
+    without = nominal(hidden.model, made.excitation, len(made.time))
+    commands = np.tile(made.command, (len(hidden.names), 1))
+    effects = [{name: made.sizes[name]} for name in hidden.names]
+    changes = plant(hidden.model, effects, commands, excitation(hidden.model, 0)[1]) - without.position
+    found = []
+    for i, change in enumerate(changes):
+        q = np.linalg.qr(np.concatenate([without.basis, np.delete(changes, i, axis=0).T], axis=1))[0]
+        left = change - q @ (q.T @ change)
+        found.append(float(left @ left) / hidden.variance)
+    return found
