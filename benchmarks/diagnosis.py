@@ -268,6 +268,8 @@ def main() -> None:
         same = [t for t in trials if (t.kind, t.hidden.model) == key]
         chunks += [same[k : k + 8] for k in range(0, len(same), 8)]
     rows: list[dict[str, Any]] = []
+    # Threads of OpenBLAS that wait for each other in several processes at once take half of the machine.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
         # In the order in which they end: what has been measured is kept, even if the rest is interrupted.

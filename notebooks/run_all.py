@@ -3,6 +3,7 @@
 Two at a time: compiling, most of what they do, takes one core.
 """
 
+import os
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +27,8 @@ def run(path: Path) -> None:
         nbformat.write(notebook, path)
 
 
+# Threads of OpenBLAS that wait for each other in two kernels at once take half of the machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 chosen = [a for a in sys.argv[1:] if not a.startswith("-")] or ["*.ipynb"]
 paths = sorted({p for pattern in chosen for p in Path(__file__).parent.glob(pattern)})
 with ThreadPoolExecutor(2) as pool:

@@ -1,5 +1,11 @@
 """Strict JAX and checked shapes, under test only: users pay for neither."""
 
+import os
+
+# Before NumPy is imported, and for the workers: threads of OpenBLAS that wait for each other in several processes at
+# once take half of the machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 from beartype import BeartypeConf
 from jaxtyping import install_import_hook

@@ -257,6 +257,16 @@ def test_causes_that_cannot_be_told_apart_are_told_as_such(diagnosis):
     assert title.endswith(": ambiguous: sensor lag; and sensor bias or input bias")
 
 
+@pytest.mark.parametrize(
+    ("innocent", "why"),
+    [(True, "a single term explains the record better than several effects of the bank together"),
+     (False, "no effect of the bank leaves an innocent residual")],
+)  # fmt: skip
+def test_why_it_is_unexplained_is_said(diagnosis, innocent, why):
+    unexplained = dataclasses.replace(diagnosis, verdict="unexplained", causes=(), innocent=innocent)
+    assert f"unexplained. Something is missing, and {why}." in str(unexplained)
+
+
 def test_what_was_not_there_is_excluded_or_said_to_be_unseen(diagnosis):
     excluded = {e.cause: e.above for e in diagnosis.excluded}
     assert "sensor_bias" not in excluded and "sensor_bias" not in diagnosis.unseen

@@ -127,6 +127,14 @@ def test_what_makes_the_same_record_stays_one_group_beside_a_harmonic_force(seed
     assert held(found) == {"harmonic_force", "constant_force", "input_bias"}, said
 
 
+@of_the_oscillator
+def test_what_makes_the_same_record_stays_one_group_beside_an_effect_that_turns_the_phase():
+    # With the stiffness out, parameters that stay where they are lose the phase: refits from there go nowhere.
+    hidden = Hidden("van_der_pol", "white", 1e-2, ("input_gain", "asymmetric_damping"), 913980658)
+    found, _, said = diagnosed(hidden)
+    assert {"input_gain", "linear_stiffness", "asymmetric_damping"} <= held(found), said
+
+
 @of_the_servovalve
 def test_an_effect_that_the_bank_lacks_is_unexplained():
     found, _, said = diagnosed(Hidden("servovalve", "white", VARIANCE["servovalve"], ("unknown_spool_notch",), 3))

@@ -101,7 +101,7 @@ def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
     limit, rival = names.index("input_saturation"), names.index("input_gain")
     trials = trials_of(bench, lambda stage: None)
     white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
-    without = refit_sets(trials, [bench.nominal], [()], white)
+    without = refit_sets(trials, [[bench.nominal]], [()], white)
     (column,) = bench.columns_of(bench.candidates[limit])
     unit = bench.problem.coordinates.upper[column]
     start = without.points[0].copy()

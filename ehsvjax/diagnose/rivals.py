@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits, refit
+from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.trials import REFITTED_TOGETHER, Trials, fits, refit_screened, refit_sets, without
@@ -90,15 +91,16 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     bench = trials.bench
     start = without(bench, final.points[0], own)
     current = refit_sets(trials, [[start]], [rest], white)
-    # Refits from far off end in local minima, and what is like the effect there need not be like it here.
     far = bool(current.cost[0] > _FAR**2 * white.used.sum())
-    found = {} if rest and not far else _refitted_from(trials, current, own, rest, white)
-    if rest or far:
-        # Other effects do not always find back, a frequency for one, once they have gone to make up for what is not
-        # there: they start where they are with the effect.
-        beside = refit(bench, start[None], current.chosen, white, iterations=1)
-        for candidate, refitted in _refitted_from(trials, beside, own, rest, white, thoroughly=far).items():
-            found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
+    found: dict[int, Refits] = {}
+    if far or not rest:
+        found = _refitted_from(trials, current, own, rest, white)
+    if far:
+        # Refits from far off end in local minima, and what is like the effect there need not be like it here.
+        here = refit(bench, start[None], current.chosen, white, iterations=1)
+        found = _lower(found, _refitted_from(trials, here, own, rest, white, thoroughly=True))
+    elif rest:
+        found = _refitted_from(trials, _beside(trials, start, current, white), own, rest, white)
     rivals = [
         Rival(candidate, _cost(refitted) + PER_NUMBER * bench.numbers_of(candidate), refitted)
         for candidate, refitted in (found | {own: min(found.get(own, final), final, key=_cost)}).items()
@@ -114,6 +116,26 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
 
 def _cost(refitted: Refits) -> float:
     return float(refitted.cost[0])
+
+
+def _lower(some: dict[int, Refits], others: dict[int, Refits]) -> dict[int, Refits]:
+    """Return the lower refit of each candidate."""
+    both = {**others, **some}
+    return both | {i: min(some[i], others[i], key=_cost) for i in some.keys() & others.keys()}
+
+
+def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Refits, white: Whitening) -> Refits:
+    """Return the point where the model's own unknowns are refitted, and other effects stay as they are with the cause.
+
+    Once these have gone to make up for what is not there, they do not always find back: a frequency for one.
+    """
+    bench = trials.bench
+    own = bench.base_columns
+    # The model's unknowns from where they are with the cause, and from where they are without it.
+    starts = np.stack([start, start])
+    starts[1, own] = current.points[0, own]
+    held = refit(bench, starts, padded([own] * 2, current.chosen.shape[1]), white)
+    return refit(bench, held.points[np.argmin(held.cost)][None], current.chosen, white, iterations=1)
 
 
 def _refitted_from(

@@ -30,7 +30,9 @@ def verdict(diagnosis: "Diagnosis") -> str:
         return f"{causes(diagnosis)}.{left}"
     if diagnosis.verdict == "ambiguous":
         return f"ambiguous: {causes(diagnosis)}: this record cannot tell.{left}"
-    return "unexplained. Something is missing, and no effect of the bank leaves an innocent residual."
+    better = "a single term explains the record better than several effects of the bank together"
+    why = better if diagnosis.innocent else "no effect of the bank leaves an innocent residual"
+    return f"unexplained. Something is missing, and {why}."
 
 
 def causes(diagnosis: "Diagnosis") -> str:
