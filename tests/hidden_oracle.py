@@ -43,8 +43,6 @@ _RIVALS_REFITTED = 3
 _HARMONIC = ("harmonic_force", "parametric_excitation")
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
-# Of a filter, which the plant does not take side by side.
-_ALONE = ("damping_ratio", "natural_frequency")
 _INITIAL_CONDITIONS = {"servovalve": 1, "van_der_pol": 2}
 # Differences for derivatives: share of a parameter, initial condition, share of an effect's number.
 _OF_PARAMETER, _OF_INITIAL, _OF_SIZE = 1e-5, {"servovalve": 1e-6, "van_der_pol": 1e-5}, 1e-4
@@ -168,14 +166,8 @@ def _positions(model: str, command, points, effects) -> np.ndarray:
     if model == "van_der_pol":
         alpha, gamma, initial = points[:, 0], points[:, 1], points[:, 2:]
         return van_der_pol_with(effects, commands, period, alpha, gamma, initial, fine_step=_REFIT_STEP)["position"]
-    columns = {name: points[:, i] for i, name in enumerate([*TRUTH[model], "initial_position"])}
-    found = np.empty_like(commands)
-    filters = np.stack([columns[name] for name in _ALONE], axis=1)
-    for one in np.unique(filters, axis=0):
-        at = np.flatnonzero((filters == one).all(axis=1))
-        valve = {name: column[at] for name, column in columns.items()} | dict(zip(_ALONE, one, strict=True))
-        found[at] = servovalve_with([effects[i] for i in at], commands[at], period, **valve)["position"]
-    return found
+    valve = {name: points[:, i] for i, name in enumerate([*TRUTH[model], "initial_position"])}
+    return servovalve_with(effects, commands, period, **valve)["position"]
 
 
 class Nominal(NamedTuple):

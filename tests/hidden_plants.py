@@ -135,13 +135,13 @@ def servovalve_with(
     noise: np.ndarray | None = None,
     initial_position: float | np.ndarray = 0.0,
     fine_step: float = SERVOVALVE_STEP,
-    **valve: float,
+    **valve: float | np.ndarray,
 ) -> dict[str, np.ndarray]:
     """Simulate servovalves from rest at a position over a command [batch, time], m of stroke, held between samples.
 
-    Takes one mapping of effects for each record, the parameters of `Valve`, and noise [batch, time], m, to be added
-    to the position before it is quantised. Returns, [batch, time], the measured position m, the spool's displacement
-    before bias and dead zone m, and the load pressure Pa.
+    Takes one mapping of effects for each record, the parameters of `Valve`, one for all or [batch], and noise
+    [batch, time], m, to be added to the position before it is quantised. Returns, [batch, time], the measured
+    position m, the spool's displacement before bias and dead zone m, and the load pressure Pa.
     """
     if unknown := set(valve) - set(Valve._fields):
         raise ValueError(f"unknown parameters of the servovalve: {sorted(unknown)}")
@@ -152,7 +152,8 @@ def servovalve_with(
     substeps, step = _substeps(sample_period, fine_step)
     duration = samples * sample_period
     delayed = _delayed_command(command, sizes, step, substeps)
-    filter_matrix = _filter_matrix(valve.natural_frequency, valve.damping_ratio, step)
+    filters = np.broadcast_arrays(np.atleast_1d(valve.natural_frequency), valve.damping_ratio)
+    filter_matrix = np.stack([_filter_matrix(*one, step) for one in zip(*filters, strict=True)], axis=-1)
     rate_limit, flexibility = sizes.get("spool_rate_limit"), sizes.get("structural_flexibility")
     hysteresis, backlash = sizes.get("torque_motor_hysteresis", 0.0), sizes.get("feedback_backlash", 0.0)
     lag = sizes.get("sensor_lag")
@@ -172,7 +173,7 @@ def servovalve_with(
             driven = _play(held - valve.feedback_gain * fed_back, driven, hysteresis)
             error[:] = driven
             next_error[:] = _play(held - valve.feedback_gain * _play(expected, fed_back, backlash), driven, hysteresis)
-            spool_between, spool_after, rate_after = filter_matrix @ spool_and_input
+            spool_between, spool_after, rate_after = np.einsum("ijb,jb->ib", filter_matrix, spool_and_input)
             if rate_limit is not None:
                 excess = rate_after - _clipped(rate_after, -rate_limit, rate_limit)
                 rate_after = rate_after - excess
