@@ -95,6 +95,16 @@ def test_unknowns_beside_a_curve_make_up_for_what_they_can(bench):
     assert free.cost[0] <= beside.cost[0] < float(at_once @ at_once)
 
 
+def test_a_set_that_cannot_be_simulated_does_not_get_the_refit_of_another():
+    bench = bench_of(0.7)
+    trials = trials_of(bench, lambda stage: None)
+    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    lost = np.full_like(bench.nominal, np.nan)
+    found = refit_sets(trials, [[bench.nominal], [lost]], [(), (0,)], white)
+    assert np.isfinite(found.cost[0]) and found.cost[1] == np.inf
+    assert set(trials.reached) == {frozenset()}
+
+
 def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
     bench = bench_of(0.7)
     names = [c.name for c in bench.candidates]

@@ -82,7 +82,9 @@ def refit_sets(
     of = np.repeat(np.arange(len(sets)), [len(choice) for choice in choices])
     columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
     led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], white, race=race)
-    found = led.of([int(np.argmin(np.where(of == i, led.cost, np.inf))) for i in range(len(sets))])
+    # Among its own: a set of which no start can be simulated is not to have another's refit.
+    own = [np.flatnonzero(of == i) for i in range(len(sets))]
+    found = led.of([int(rows[np.argmin(led.cost[rows])]) for rows in own])
     for point, cost, included in zip(found.points, found.cost, sets, strict=True):
         if np.isfinite(cost):
             trials.reached[frozenset(included)] = point
