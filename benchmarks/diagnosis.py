@@ -12,12 +12,9 @@ processes, one on each core; each trial can be repeated from its seed.
 
 import argparse
 import json
-import multiprocessing
-import os
 import sys
 import time
 import traceback
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,6 +28,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 import ehsvjax
+from benchmarks.processes import workers
 from ehsvjax.diagnose import Diagnosis, diagnose
 from ehsvjax.diagnose.missing import MissingTerm
 from tests.hidden_oracle import SEPARABLE, oracle, worth_each
@@ -268,10 +266,7 @@ def main() -> None:
         same = [t for t in trials if (t.kind, t.hidden.model) == key]
         chunks += [same[k : k + 8] for k in range(0, len(same), 8)]
     rows: list[dict[str, Any]] = []
-    # Threads of OpenBLAS that wait for each other in several processes at once take half of the machine.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+    with workers() as pool:
         # In the order in which they end: what has been measured is kept, even if the rest is interrupted.
         for found in tqdm(pool.map(tried, chunks), total=len(chunks), mininterval=10.0):
             rows += found

@@ -12,11 +12,8 @@ profile likelihood is asked as well, of the first draws. Draws are shared out to
 
 import argparse
 import json
-import multiprocessing
-import os
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -32,6 +29,7 @@ from tqdm import tqdm
 
 import ehsvjax
 from benchmarks import monte_carlo
+from benchmarks.processes import workers
 
 matplotlib.use("Agg")
 
@@ -188,10 +186,7 @@ def main() -> None:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     tables = []
-    # Threads of OpenBLAS that wait for each other in several processes at once take half of the machine.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(os.cpu_count(), mp_context=context) as pool:
+    with workers() as pool:
         for name, make in EXPERIMENTS.items():
             if options.model not in (name, "both"):
                 continue

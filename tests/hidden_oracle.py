@@ -129,23 +129,22 @@ def left_beside(model: str, made: Made, beside: Mapping[str, Mapping[str, float]
 
     All refitted by least squares: the parameters that are identified, initial conditions and the effects' numbers.
     """
-    parameters = list(TRUTH[model].values())
+    plain, changes = _identified(model)
     numbers = [(name, number) for name, sizes in beside.items() for number in sizes]
-    sizes = [beside[name][number] for name, number in numbers]
-    initial = _INITIAL_CONDITIONS[model]
-    start = np.array([*parameters, *[0.0] * initial, *sizes])
-    least = 0.0 if model == "servovalve" else -np.inf
-    lowest = [least] * len(parameters) + [-np.inf] * initial
-    lowest += [0.0 if name in ONE_SIDED else -np.inf for name, _ in numbers]
-    changes = (_OF_PARAMETER * np.abs(parameters), [_OF_INITIAL[model]] * initial, _OF_SIZE * np.abs(sizes))
-    steps = np.concatenate(changes)
+    sizes = np.array([beside[name][number] for name, number in numbers])
+    start = np.concatenate([plain, sizes])
+    steps = np.concatenate([changes, _OF_SIZE * np.abs(sizes)])
+    lowest = np.full(len(start), -np.inf)
+    if model == "servovalve":
+        lowest[: len(TRUTH[model])] = 0.0
+    lowest[len(plain) :] = [0.0 if name in ONE_SIDED else -np.inf for name, _ in numbers]
 
     def positions(points):
         effects = [{name: {} for name in beside} for _ in points]
         for effect, point in zip(effects, points, strict=True):
-            for (name, number), value in zip(numbers, point[len(parameters) + initial :], strict=True):
+            for (name, number), value in zip(numbers, point[len(plain) :], strict=True):
                 effect[name][number] = value
-        return _positions(model, made.command, points[:, : len(parameters) + initial], effects)
+        return _positions(model, made.command, points[:, : len(plain)], effects)
 
     def left(point):
         return made.clean - positions(point[None])[0]
@@ -160,6 +159,15 @@ def left_beside(model: str, made: Made, beside: Mapping[str, Mapping[str, float]
     return found.fun
 
 
+def _identified(model: str) -> tuple[np.ndarray, np.ndarray]:
+    """Return a plant's parameters that are identified and its initial conditions, and changes for derivatives."""
+    parameters = np.array([*TRUTH[model].values()])
+    initial = np.zeros(_INITIAL_CONDITIONS[model])
+    return np.concatenate([parameters, initial]), np.concatenate(
+        [_OF_PARAMETER * parameters, initial + _OF_INITIAL[model]]
+    )
+
+
 def _positions(model: str, command, points, effects) -> np.ndarray:
     """Return the positions [point, time] of plants whose parameters and initial conditions are [point, number]."""
     commands, period = np.tile(command, (len(points), 1)), excitation(model, 0)[1]
@@ -171,7 +179,7 @@ def _positions(model: str, command, points, effects) -> np.ndarray:
 
 
 class Nominal(NamedTuple):
-    """A servovalve without any effect: its position [time], and orthonormal directions [time, direction].
+    """A plant without any effect: its position [time], and orthonormal directions [time, direction].
 
     The directions are those of its parameters and initial conditions: what lies outside them no refit could do, to
     first order.
@@ -190,10 +198,9 @@ class Nominal(NamedTuple):
 def nominal(model: str, seed: int, samples: int) -> Nominal:
     """Return the plant without any effect under an excitation."""
     command = excitation(model, seed)[0][:samples]
-    initial = _INITIAL_CONDITIONS[model]
-    plain = np.array([*TRUTH[model].values(), *[0.0] * initial])
-    moved = plain + np.diag([*(_OF_PARAMETER * plain[:-initial]), *[_OF_INITIAL[model]] * initial])
-    y = _positions(model, command, np.concatenate([plain[None], moved]), [{}] * (1 + len(moved)))
+    plain, changes = _identified(model)
+    points = np.concatenate([plain[None], plain + np.diag(changes)])
+    y = _positions(model, command, points, [{}] * len(points))
     return Nominal(y[0], np.linalg.qr((y[1:] - y[0]).T)[0])
 
 
@@ -232,7 +239,7 @@ def _variants(model: str) -> dict[str, list[dict[str, float]]]:
 
 
 def _nearest(model: str, every: Mapping[str, np.ndarray], name: str, unit: np.ndarray) -> dict[str, float]:
-    """Return the sizes of an effect that are most like a direction: from there it is refitted."""
+    """Return sizes from which an effect is refitted: the oscillator's medium ones, else those most like a direction."""
     if model == "van_der_pol":
         return _variants(model)[name][1]
     return _variants(model)[name][int(np.argmax(every[name] @ unit))]

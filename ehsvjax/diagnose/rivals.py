@@ -92,15 +92,13 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     start = without(bench, final.points[0], own)
     current = refit_sets(trials, [[start]], [rest], white)
     far = bool(current.cost[0] > _FAR**2 * white.used.sum())
-    found: dict[int, Refits] = {}
-    if far or not rest:
-        found = _refitted_from(trials, current, own, rest, white)
+    base = _beside(trials, start, current, white) if rest and not far else current
+    found = _refitted_from(trials, base, own, rest, white)
     if far:
         # Refits from far off end in local minima, and what is like the effect there need not be like it here.
         here = refit(bench, start[None], current.chosen, white, iterations=1)
-        found = _lower(found, _refitted_from(trials, here, own, rest, white, thoroughly=True))
-    elif rest:
-        found = _refitted_from(trials, _beside(trials, start, current, white), own, rest, white)
+        for candidate, refitted in _refitted_from(trials, here, own, rest, white, thoroughly=True).items():
+            found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
     rivals = [
         Rival(candidate, _cost(refitted) + PER_NUMBER * bench.numbers_of(candidate), refitted)
         for candidate, refitted in (found | {own: min(found.get(own, final), final, key=_cost)}).items()
@@ -118,12 +116,6 @@ def _cost(refitted: Refits) -> float:
     return float(refitted.cost[0])
 
 
-def _lower(some: dict[int, Refits], others: dict[int, Refits]) -> dict[int, Refits]:
-    """Return the lower refit of each candidate."""
-    both = {**others, **some}
-    return both | {i: min(some[i], others[i], key=_cost) for i in some.keys() & others.keys()}
-
-
 def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Refits, white: Whitening) -> Refits:
     """Return the point where the model's own unknowns are refitted, and other effects stay as they are with the cause.
 
@@ -139,12 +131,7 @@ def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Ref
 
 
 def _refitted_from(
-    trials: Trials,
-    base: Refits,
-    own: int,
-    rest: tuple[int, ...],
-    white: Whitening,
-    thoroughly: bool = False,
+    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, thoroughly: bool = False
 ) -> dict[int, Refits]:
     """Return the refits of candidates that are, at a point without the effect, most like it.
 
