@@ -10,7 +10,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize_scalar
 
 from tests.hidden_plants import effect_sizes, servovalve_with, van_der_pol_with
 from tests.hidden_records import COARSEST, ONE_SIDED, TRUTH, Hidden, Made, excitation, plant
@@ -39,8 +39,9 @@ _IMPLAUSIBLE = (("constant_load", {"force": 1e4}), ("constant_load", {"force": -
 # Shares of a servovalve's worth below which what is left to first order is not trusted: it is refitted in the plant.
 _OF_FIRST_ORDER = 0.03
 # Rivals that are refitted in the place of what is hidden.
-_RIVALS_REFITTED = 3
-_HARMONIC = ("harmonic_force", "parametric_excitation")
+_RIVALS_REFITTED, _HARMONIC_REFITTED = 3, 2
+# Rivals of the oscillator's with a frequency, rad/s, any of which may be the one that is like something else; phases.
+_HARMONIC, _HIGHEST_FREQUENCY, _PHASES = ("harmonic_force", "parametric_excitation"), 6.0, 8
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
 _INITIAL_CONDITIONS = {"servovalve": 1, "van_der_pol": 2}
@@ -53,7 +54,8 @@ class Oracle(NamedTuple):
 
     Attributes:
         worth: of it beside a refit of what is known.
-        deficit: by which the best rival is worse; 0 for a rival that makes the same record.
+        deficit: by which the best rival is worse; 0 for a rival that makes the same record. Where one is not worse by
+            `SEPARABLE`, others are not asked any further.
         rival: that rival: one other effect, for two effects together any one; for an effect that is in no bank two.
 
     """
@@ -76,21 +78,22 @@ def oracle(hidden: Hidden, made: Made) -> Oracle:
             return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][name])
     every = library(hidden.model, made.excitation, len(made.time))
     if hidden.names[0].startswith("unknown"):
-        rivals = {pair: _share_of(unit, *(every[other] for other in pair)) for pair in combinations(every, 2)}
+        rivals = {names: _together(unit, names, every) for names in combinations(every, 2)}
     else:
-        rivals = {(other,): float(np.max((every[other] @ unit) ** 2)) for other in every if hidden.names != (other,)}
-    best = sorted(rivals, key=lambda names: -rivals[names])
-    deficits = {names: size * (1.0 - rivals[names]) for names in best}
-    doubtful = best[:_RIVALS_REFITTED]
-    if hidden.model == "van_der_pol":
-        # What is to make up for something else may have to be large, or of a frequency that the library lacks.
-        doubtful = list(dict.fromkeys([*doubtful, *((name,) for name in _HARMONIC if (name,) in deficits)]))
-    elif deficits[best[0]] > SEPARABLE:
+        rivals = {(name,): _alone(unit, name, every) for name in every if hidden.names != (name,)}
+    best = sorted(rivals, key=lambda names: -rivals[names].share)
+    deficits = {names: size * (1.0 - rivals[names].share) for names in best}
+    # What has a frequency and a phase to choose is more like anything to first order than what it is.
+    harmonic = [names for names in best if set(names) & set(_HARMONIC)]
+    doubtful = [names for names in best if names not in harmonic][:_RIVALS_REFITTED] + harmonic[:_HARMONIC_REFITTED]
+    if hidden.model == "servovalve":
         doubtful = [names for names in doubtful if deficits[names] < _OF_FIRST_ORDER * size]
-    else:
-        doubtful = []
+    elif hidden.names != ("process_noise",):
+        deficits["process_noise",] = _deficit_of_random_force(left / hidden.variance**0.5, made)
     for names in doubtful:
-        left = left_beside(hidden.model, made, {name: _nearest(hidden.model, every, name, unit) for name in names})
+        if min(deficits.values()) <= SEPARABLE:
+            break
+        left = left_beside(hidden.model, made, rivals[names].start)
         deficits[names] = min(deficits[names], float(left @ left) / hidden.variance)
     rival = min(deficits, key=lambda names: deficits[names])
     return Oracle(size, deficits[rival], " and ".join(rival))
@@ -169,8 +172,11 @@ def _identified(model: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _positions(model: str, command, points, effects) -> np.ndarray:
-    """Return the positions [point, time] of plants whose parameters and initial conditions are [point, number]."""
-    commands, period = np.tile(command, (len(points), 1)), excitation(model, 0)[1]
+    """Return the positions [point, time] of plants whose parameters and initial conditions are [point, number].
+
+    Over one command [time], or one each [point, time].
+    """
+    commands, period = np.broadcast_to(command, (len(points), command.shape[-1])), excitation(model, 0)[1]
     if model == "van_der_pol":
         alpha, gamma, initial = points[:, 0], points[:, 1], points[:, 2:]
         return van_der_pol_with(effects, commands, period, alpha, gamma, initial, fine_step=_REFIT_STEP)["position"]
@@ -204,25 +210,38 @@ def nominal(model: str, seed: int, samples: int) -> Nominal:
     return Nominal(y[0], np.linalg.qr((y[1:] - y[0]).T)[0])
 
 
-@functools.cache
-def library(model: str, seed: int, samples: int) -> dict[str, np.ndarray]:
-    """Return what a plant could do instead of an effect that is hidden: by its name [variant, time], of unit length.
+class Variants(NamedTuple):
+    """An effect at several sizes: what each does outside what a refit could do, [variant, time], of unit length."""
 
-    Each effect at small, medium and large sizes, and a few implausible ones, outside what a refit could do.
+    sizes: list[dict[str, float]]
+    directions: np.ndarray
+
+    def like(self, unit: np.ndarray) -> np.ndarray:
+        """Return the cosines [variant] of the angles to a direction."""
+        return self.directions @ unit
+
+
+@functools.cache
+def library(model: str, seed: int, samples: int) -> dict[str, Variants]:
+    """Return what a plant could do instead of an effect that is hidden, by its name.
+
+    Each effect at small, medium and large sizes, and a few implausible ones; the oscillator's harmonic ones, small, at
+    every frequency that the record tells from the next.
     """
     command, period = excitation(model, seed)
-    every = [(name, sizes) for name, some in _variants(model).items() for sizes in some]
-    y = plant(model, [{name: sizes} for name, sizes in every], np.tile(command[:samples], (len(every), 1)), period)
-    without = nominal(model, seed, samples)
-    directions: dict[str, list[np.ndarray]] = {}
-    for (name, _), row in zip(every, y, strict=True):
-        left = without.outside(row)
-        directions.setdefault(name, []).append(left / max(np.linalg.norm(left), 1e-300))
-    return {name: np.array(rows) for name, rows in directions.items()}
+    without, variants = nominal(model, seed, samples), _variants(model, samples * period)
+    effects = [{name: sizes} for name, some in variants.items() for sizes in some]
+    points = np.tile(_identified(model)[0], (len(effects), 1))
+    left = np.array([without.outside(row) for row in _positions(model, command[:samples], points, effects)])
+    left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-300)
+    ends = np.cumsum([len(some) for some in variants.values()])[:-1]
+    return {
+        name: Variants(some, rows) for (name, some), rows in zip(variants.items(), np.split(left, ends), strict=True)
+    }
 
 
-def _variants(model: str) -> dict[str, list[dict[str, float]]]:
-    """Return small, medium and large sizes of each effect of a bank, and medium ones of the other sign."""
+def _variants(model: str, duration: float) -> dict[str, list[dict[str, float]]]:
+    """Return sizes of each effect of a bank, for a record of a duration, s."""
     ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
     found = {
         name: [
@@ -235,14 +254,50 @@ def _variants(model: str) -> dict[str, list[dict[str, float]]]:
     for name, sizes in _IMPLAUSIBLE:
         if name in found:
             found[name].append(sizes)
+    half_wave = np.pi / duration
+    for name in set(_HARMONIC) & set(found):
+        found[name] = [
+            {**found[name][0], "frequency": frequency, "phase": phase}
+            for frequency in np.arange(half_wave, _HIGHEST_FREQUENCY, half_wave)
+            for phase in (np.arange(_PHASES) + 0.5) * 2.0 * np.pi / _PHASES
+        ]
     return found
 
 
-def _nearest(model: str, every: Mapping[str, np.ndarray], name: str, unit: np.ndarray) -> dict[str, float]:
-    """Return sizes from which an effect is refitted: the oscillator's medium ones, else those most like a direction."""
-    if model == "van_der_pol":
-        return _variants(model)[name][1]
-    return _variants(model)[name][int(np.argmax(every[name] @ unit))]
+@functools.cache
+def random_force(seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return how a force of white noise moves the oscillator outside what a refit could do, to first order.
+
+    Orthonormal directions [time, direction], the strongest first, and the deviation along each if the velocity is
+    kicked in every sample by a deviation of 1.
+    """
+    command, period = excitation("van_der_pol", seed)
+    command = command[:samples]
+    small = 1e-3
+    point = _identified("van_der_pol")[0]
+    commands = command + small / period * np.eye(samples)
+    y = _positions("van_der_pol", commands, np.tile(point, (samples, 1)), [{}] * samples)
+    without = nominal("van_der_pol", seed, samples)
+    kicked = np.array([without.outside(row) for row in y]) / small
+    directions, deviations, _ = np.linalg.svd(kicked.T, full_matrices=False)
+    return directions, deviations
+
+
+def _deficit_of_random_force(left: np.ndarray, made: Made) -> float:
+    """Return by how much a random force explains worse what no refit does, left, [time], in deviations of the noise.
+
+    Twice the logarithm of the likelihoods, expected over noise of variance 1, at the intensity that is best.
+    """
+    directions, deviations = random_force(made.excitation, len(made.time))
+    along = (directions.T @ left) ** 2
+    rest = float(left @ left - along.sum())
+
+    def deficit(log_intensity):
+        spread = 1.0 + np.exp(log_intensity) * deviations**2
+        return rest + float(np.sum((1.0 + along) / spread + np.log(spread) - 1.0))
+
+    none = -2.0 * np.log(deviations[0])
+    return float(minimize_scalar(deficit, bounds=(none - 10.0, none + 25.0), method="bounded").fun)
 
 
 def _between(low: float, high: float, share: float) -> float:
@@ -262,10 +317,26 @@ def _is_noise(name: str, hidden: Hidden, made: Made) -> bool:
     return name == "sensor_quantisation" and made.sizes[name]["step"] < COARSEST * hidden.variance**0.5
 
 
-def _share_of(unit: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
-    """Return the share of a direction that two effects take together, each at the best of its sizes."""
-    a, b, c = (first @ unit)[:, None], (second @ unit)[None, :], first @ second.T
-    return float(np.max((a**2 + b**2 - 2.0 * a * b * c) / np.maximum(1.0 - c**2, 1e-6)))
+class Rival(NamedTuple):
+    """Effects instead of what is hidden: the share of it that they take to first order, sizes to refit them from."""
+
+    share: float
+    start: dict[str, dict[str, float]]
+
+
+def _alone(unit: np.ndarray, name: str, every: Mapping[str, Variants]) -> Rival:
+    """Return one effect as a rival of what points in a direction, at the best of its sizes."""
+    like = every[name].like(unit)
+    return Rival(float(np.max(like**2)), {name: every[name].sizes[int(np.argmax(like))]})
+
+
+def _together(unit: np.ndarray, names: tuple[str, str], every: Mapping[str, Variants]) -> Rival:
+    """Return two effects as a rival, each at the best of its sizes."""
+    first, second = (every[name] for name in names)
+    a, b, c = first.like(unit)[:, None], second.like(unit)[None, :], first.directions @ second.directions.T
+    shares = (a**2 + b**2 - 2.0 * a * b * c) / np.maximum(1.0 - c**2, 1e-6)
+    i, j = np.unravel_index(np.argmax(shares), shares.shape)
+    return Rival(float(shares[i, j]), {names[0]: first.sizes[i], names[1]: second.sizes[j]})
 
 
 def _worth_to_first_order(hidden: Hidden, made: Made) -> list[float]:
