@@ -1,10 +1,15 @@
 """Strict JAX and checked shapes, under test only: users pay for neither."""
 
 import os
+from pathlib import Path
 
 # Before NumPy is imported, and for the workers: threads of OpenBLAS that wait for each other in several processes at
 # once take half of the machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Half of the tests' time is compiling, and workers and processes would compile much of it again. Delete the folder to
+# have everything compiled anew.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax
 from beartype import BeartypeConf
