@@ -72,6 +72,9 @@ class Effort(NamedTuple):
         starts_agreeing: how many of them led to the same minimum.
         converged: whether the refinement has, by its own test; without refinement, whether the search's stop test has.
         remaining: noise variances by which another step would still lower the sum of squares, to first order.
+        step_size: of the integration, s: the model's `max_step`, or what the arithmetic needed.
+        arithmetic: noise variances by which the error of integration is off in the sum of squares.
+        left_out: readings that no useful step knows, such as those beside a jump of a pressure: they carry no weight.
 
     """
 
@@ -85,6 +88,9 @@ class Effort(NamedTuple):
     starts_agreeing: int
     converged: bool
     remaining: float
+    step_size: float = float("nan")
+    arithmetic: float = float("nan")
+    left_out: int = 0
 
 
 @dataclass(frozen=True, eq=False)

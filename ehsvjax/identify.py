@@ -12,11 +12,12 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, Key
 
 from ehsvjax import genetic
+from ehsvjax.arithmetic import arithmetic_at, outputs_of, settled_at
 from ehsvjax.draws import check_key
 from ehsvjax.fit import Effort, Fit, History, at_bound
 from ehsvjax.genetic import Operators
 from ehsvjax.models.model import Model
-from ehsvjax.population import Problem, cast, population_cost, residuals, shared_cost, to_unit, to_values
+from ehsvjax.population import Problem, cast, population_cost, shared_cost, to_unit, to_values
 from ehsvjax.record import Record
 from ehsvjax.refine import Refined
 from ehsvjax.refine import refine as refine_starts
@@ -24,6 +25,8 @@ from ehsvjax.search import search
 from ehsvjax.unknowns import Initial, problem_of
 
 DEFAULT_OPERATORS = Operators()
+# Of refinement, at most, until the weights of the outputs, the step and the readings that are known no longer change.
+_ROUNDS = 10
 
 
 def identify(
@@ -93,7 +96,8 @@ def identify(
 
     compiling = _compile_refinement(problem, starts, population) if refine else None
     found, history = search(
-        Partial(cost, cast(problem, jnp.float32)),
+        # A number of steps that is compiled in is a tenth faster.
+        Partial(cost, cast(replace(problem, substeps=None), jnp.float32)),
         key,
         unknowns=problem.unknowns,
         population=population,
@@ -107,6 +111,7 @@ def identify(
     )
     effort = _search_effort(found, generations)
     individual = np.asarray(found.elites, np.float64)[0]
+    problem = settled_at(problem, individual)
     if compiling is not None:
         compiling.join()
         candidates = _candidates(problem, model, found, starts)
@@ -114,10 +119,8 @@ def identify(
         individual, effort = _best_of(refined, agreeing, effort)
     elif noise_variance is None:
         problem = replace(problem, noise_variance=_residual_variance(problem, _residuals_of(problem, individual)))
+        problem = settled_at(problem, individual)
     return _fit(model, records, problem, individual, history, effort, noise_variance is not None)
-
-
-_residuals = jax.jit(residuals)
 
 
 def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
@@ -232,10 +235,10 @@ def _with_nominal_initial(problem: Problem, model: Model, individual) -> Float[n
 
 
 def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refined, int, Problem]:
-    """Refine; then, while the weights of the outputs still change, weigh them by their residuals and refine again.
+    """Refine; then, while weights, step or readings that are known change, refine again with those found there.
 
-    With one output and squared residuals the weight does not move the minimum, and one round is enough. The number
-    returned says how many starts came to within a tenth of a noise variance of the same minimum, in the first round.
+    With one output and squared residuals its weight does not move the minimum. The number returned says how many starts
+    came to within a tenth of a noise variance of the same minimum, in the first round.
     """
     with jax.enable_x64(True):
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
@@ -243,16 +246,17 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
         refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
         least = np.min(refined.cost)
         agreeing = int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))
-        if not reweigh:
-            return refined, agreeing, problem
         several = len(problem.observed) > 1 or problem.huber is not None
-        for _ in range(10 if several else 1):
+        for _ in range(_ROUNDS):
             best = np.argmin(refined.cost)
-            variance = _residual_variance(problem, refined.residuals[best])
-            settled = np.allclose(variance, problem.noise_variance, rtol=0.01)
-            problem = replace(problem, noise_variance=variance)
-            if settled or not several:
+            before = problem
+            if reweigh:
+                problem = replace(problem, noise_variance=_residual_variance(problem, refined.residuals[best]))
+            known = settled_at(problem, refined.individual[best])
+            weighed = not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)
+            if known is problem and weighed:
                 break
+            problem = known
             # From the best alone, as often as there were starts: the same shape is not compiled again.
             again = np.broadcast_to(refined.individual[best], refined.individual.shape)
             refined = _in_numpy(refine_starts(cast(problem, jnp.float64), jnp.asarray(again), held=nothing))
@@ -264,8 +268,8 @@ def _in_numpy(refined: Refined) -> Refined:
 
 
 def _residuals_of(problem: Problem, individual) -> Float[np.ndarray, "record time signal"]:
-    with jax.enable_x64(True):
-        return np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
+    difference = (problem.samples.outputs - outputs_of(problem, individual)) / np.sqrt(problem.noise_variance)
+    return np.where(problem.samples.measured, difference, 0.0)
 
 
 def _residual_variance(
@@ -300,9 +304,16 @@ def _fit(
     model, records, problem: Problem, individual, history: genetic.History, effort: Effort, noise_variance_given: bool
 ) -> Fit:
     values = _values(problem, individual)
+    step = float(np.min(problem.samples.sample_period)) / int(problem.substeps)
+    effort = effort._replace(
+        step_size=step,
+        left_out=_readings(records) - int(problem.samples.measured.sum()),
+        arithmetic=arithmetic_at(problem, individual).worth,
+    )
     parameters = {name: float(v) for name, v in zip(problem.free, values, strict=False)}
     return Fit(
-        model=model,
+        # The step is that which was needed: all that is simulated with the fit is as exact as the fit itself.
+        model=replace(model, max_step=step) if problem.substeps > problem.grid.substeps else model,
         records=records,
         parameters=parameters,
         initial=tuple(_initial_by_record(model, problem, individual)),
@@ -314,6 +325,10 @@ def _fit(
         estimated_initial=problem.free_initial,
         noise_variance_given=noise_variance_given,
     )
+
+
+def _readings(records: Sequence[Record]) -> int:
+    return sum(int(np.isfinite(series).sum()) for record in records for series in record.outputs.values())
 
 
 def _values(problem: Problem, individual) -> Float[np.ndarray, " *batch parameter"]:

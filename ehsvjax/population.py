@@ -47,7 +47,7 @@ class Coordinates(NamedTuple):
 
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["samples", "noise_variance", "coordinates", "known", "known_initial"],
+    data_fields=["samples", "noise_variance", "coordinates", "known", "known_initial", "substeps"],
     meta_fields=["equations", "grid", "observed", "free", "free_initial", "huber"],
 )
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ class Problem:
         free: names of the free parameters, static.
         free_initial: names of the initial conditions that are free, static.
         huber: residuals beyond this many standard deviations weigh linearly (Huber 1964); None: squares; static.
+        substeps: integration steps per sample as data, for one program at any step; None: as many as the grid says.
 
     """
 
@@ -79,6 +80,7 @@ class Problem:
     free: tuple[str, ...]
     free_initial: tuple[str, ...]
     huber: float | None
+    substeps: Any = None
 
     @property
     def unknowns(self) -> int:
@@ -313,7 +315,7 @@ def huber_weight(standardised: Float[Array, "..."], huber: float | None) -> Floa
 def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest, scan=kernels.scan):
     return scan_model(
         problem.equations._replace(stepper=_stored_once(problem.equations.stepper)),
-        problem.grid,
+        problem.grid if problem.substeps is None else problem.grid._replace(substeps=problem.substeps),
         identity,
         parameters,
         initial,

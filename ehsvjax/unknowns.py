@@ -53,6 +53,7 @@ def problem_of(
             if p.name not in free_initial
         },
         equations=model.equations,
+        substeps=np.int32(grid.substeps),
         grid=grid,
         observed=observed,
         free=model.free,

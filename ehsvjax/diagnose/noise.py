@@ -50,6 +50,11 @@ class Whitening(NamedTuple):
         return np.concatenate(parts, axis=-1)
 
     @property
+    def variances(self) -> Float[np.ndarray, " signal"]:
+        """Of the innovations of each output, in its unit squared: of what a sample tells alone."""
+        return np.array([noise.innovation_variance for noise in self.noises])
+
+    @property
     def coloured(self) -> bool:
         """Whether any output's noise is correlated."""
         return any(len(noise.coefficients) for noise in self.noises)

@@ -1,6 +1,6 @@
 """The search for causes: add the one that explains most, refit, look again; then its rivals, swaps and deletions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -22,11 +22,15 @@ from ehsvjax.diagnose.trials import (
     trials_of,
     without,
 )
-from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.diagnose.workbench import Workbench, settled
 
 SIGNIFICANT = 0.002
 """Corrected p-value of the whole search below which an effect is taken to be there."""
 _MOST_EFFECTS = 3
+# Rounds of swaps, deletions and new looks, in which the causes settle.
+_ROUNDS = 6
+# Deficit of rivals whose arithmetic a verdict stands on.
+_WEIGHED = 25.0
 # A term of free form that explains so much more than the best candidate shows that the bank lacks something.
 _BANK_LACKS_IT = 3.0
 # Of what is left above the noise, what the next effect must take.
@@ -34,8 +38,12 @@ _SHARE_OF_MISFIT = 0.15
 
 
 class Stage(NamedTuple):
-    """One look at what is left: the refit that it started from, the noise, and the candidates' scores."""
+    """One look at what is left: the refit that it started from, the noise, and the candidates' scores.
 
+    Its trials have the step that arithmetic needs there, and the readings that it knows.
+    """
+
+    trials: Trials
     included: tuple[int, ...]
     current: Refits
     white: Whitening
@@ -87,29 +95,35 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
     stages = [_look(trials, (), refit_sets(trials, [[bench.nominal]], [()], plain))]
     while len(stages[-1].included) < _MOST_EFFECTS:
-        found = _next_effect(trials, stages[-1])
+        found = _next_effect(stages[-1])
         if found is None:
             break
         stages.append(found)
     last = stages[-1]
     progress("refitting the rivals")
-    included, final, rivals = rivals_of_all(trials, last.included, last.current, last.white)
-    if set(included) != set(last.included):
-        last = _look(trials, included, final)
-        final = last.current
-    while True:
-        nominal = refit_sets(trials, [[stages[0].current.points[0]]], [()], last.white)
+    for _ in range(_ROUNDS):
+        trials, white = last.trials, last.white
+        included, final, rivals = rivals_of_all(trials, last.included, last.current, white)
+        nominal = refit_sets(trials, [[stages[0].current.points[0]]], [()], white)
         gains, needless = _gains(trials, included, final, nominal, last)
-        if needless is None:
+        known = settled(trials.bench, _compared(final, nominal, rivals), white.variances)
+        if needless is not None:
+            # What was added first can become needless by what was added later.
+            included = tuple(j for j in included if j != needless)
+            start = without(trials.bench, final.points[0], needless)
+            final = refit_sets(trials, [[start]], [included], white)
+        elif known is trials.bench and set(included) == set(last.included):
             break
-        # What was added first can become needless by what was added later.
-        rest = tuple(j for j in included if j != needless)
-        start = without(bench, final.points[0], needless)
-        last = _look(trials, rest, refit_sets(trials, [[start]], [rest], last.white))
-        included, final, rivals = rivals_of_all(trials, rest, last.current, last.white)
+        last = _look(trials._replace(bench=known), included, final)
     return Selection(
-        bench, trials.seen, included, final, nominal, last.white, (*stages[:-1], last), rivals, tuple(gains)
+        trials.bench, trials.seen, included, final, nominal, white, (*stages[:-1], last), rivals, tuple(gains)
     )
+
+
+def _compared(final: Refits, nominal: Refits, rivals: Sequence[Sequence[Rival]]) -> Float[np.ndarray, "individual _"]:
+    """Return the points of all explanations that a verdict weighs against each other."""
+    close = [r.refitted.points for group in rivals for r in group if r.deficit < _WEIGHED]
+    return np.concatenate([final.points, nominal.points, *close])
 
 
 def required_gain(bench: Workbench, screening: Screening, candidate: int) -> float:
@@ -122,23 +136,31 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
 
 def _look(trials: Trials, included: tuple[int, ...], current: Refits) -> Stage:
     """Look at what is left after a refit: its noise, and what could explain the rest."""
-    bench = trials.bench
-    measured = bench.problem.samples.measured
-    plain = plain_noise(bench.problem.noise_variance, measured)
-    tried = responses_at(bench, current, included, plain, trials.parts)
-    spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
-    white = noise_outside(current.residual[0], measured, spanned)
+    while True:
+        bench = trials.bench
+        measured = bench.problem.samples.measured
+        plain = plain_noise(bench.problem.noise_variance, measured)
+        tried = responses_at(bench, current, included, plain, trials.parts)
+        spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
+        white = noise_outside(current.residual[0], measured, spanned)
+        known = settled(bench, current.points, white.variances)
+        if known is bench:
+            break
+        trials = trials._replace(bench=known)
+        only_known = plain_noise(white.variances, known.problem.samples.measured)
+        current = refit_sets(trials, [[current.points[0]]], [included], only_known)
     if white.coloured or len(white.noises) > 1:
         current = refit_sets(trials, [[current.points[0]]], [included], white)
         tried = responses_at(bench, current, included, white, trials.parts)
     else:
         # The variance of one output's white noise does not move the best fit.
         current = current._replace(cost=np.array([_cost_under(current, white)]))
-    return Stage(included, current, white, screen(bench, current, tried, white, int(measured.sum()) // 2))
+    return Stage(trials, included, current, white, screen(bench, current, tried, white, int(measured.sum()) // 2))
 
 
-def _next_effect(trials: Trials, stage: Stage) -> Stage | None:
+def _next_effect(stage: Stage) -> Stage | None:
     """Return the next look, with one effect more, or none if no effect is significant."""
+    trials = stage.trials
     bench = trials.bench
     hopeful = [
         s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
@@ -162,14 +184,14 @@ def _next_effect(trials: Trials, stage: Stage) -> Stage | None:
         if without_form > _BANK_LACKS_IT * max(gain, required_gain(bench, stage.screening, candidate)):
             # A term of free form explains far more: the bank does not have what is missing.
             continue
-        if not _is_gain(trials, stage, refitted.of([chosen]), candidate):
+        if not _is_gain(stage, refitted.of([chosen]), candidate):
             continue
         best = _look(trials, (*stage.included, candidate), refitted.of([chosen]))
         if not _leaves_something(best):
             break
-        reshaped = refit_reshaped(trials, best.current, best.included, candidate, best.white)
+        reshaped = refit_reshaped(best.trials, best.current, best.included, candidate, best.white)
         if reshaped is not best.current:
-            best = _look(trials, best.included, reshaped)
+            best = _look(best.trials, best.included, reshaped)
             if not _leaves_something(best):
                 break
     return best
@@ -185,12 +207,13 @@ def _cost_under(refits: Refits, white: Whitening) -> float:
     return float(np.sum(white(refits.residual[0]) ** 2))
 
 
-def _is_gain(trials: Trials, stage: Stage, extended: Refits, candidate: int) -> bool:
+def _is_gain(stage: Stage, extended: Refits, candidate: int) -> bool:
     """Whether an effect gains enough, under the noise of the stage, and under that of what it leaves itself.
 
     The latter counts as noise whatever the effect does not explain: it cannot be fooled by a noise that was taken to be
     whiter than it is.
     """
+    trials = stage.trials
     required = required_gain(trials.bench, stage.screening, candidate)
     removable = float(stage.current.cost[0]) - stage.white.used.sum()
     # What takes only a little of a large misfit is not its cause.

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ehsvjax import arithmetic
 from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates
 from ehsvjax.effects.extended import disturbance, extended
 from ehsvjax.effects.internal import Internal, internal_signals
@@ -93,10 +94,15 @@ class Workbench:
         self,
         points: Float[np.ndarray, "individual parameter"],
         disturbances: Float[np.ndarray, "individual record time place"] | None = None,
+        substeps: int | None = None,
     ) -> Float[np.ndarray, "individual record time signal"]:
-        """Return the outputs of each point, SI, with what is added to signals while they run, beside what always is."""
+        """Return the outputs of each point, SI, with what is added to signals while they run, beside what always is.
+
+        At the bench's integration steps per sample, or at others.
+        """
         with jax.enable_x64(True):
-            problem = cast(self.problem, jnp.float64)
+            here = self.problem.substeps if substeps is None else np.int32(substeps)
+            problem = cast(replace(self.problem, substeps=here), jnp.float64)
 
         def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
             some = points[first : first + _ABREAST]
@@ -194,7 +200,21 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
             one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
             nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
     nothing = np.zeros((1, len(record), len(places)))
-    return Workbench(fit, full, problem, found, scales, internal, places, nothing, column, nominal, differences)
+    bench = Workbench(fit, full, problem, found, scales, internal, places, nothing, column, nominal, differences)
+    return settled(bench, nominal[None], problem.noise_variance)
+
+
+def settled(
+    bench: Workbench, points: Float[np.ndarray, "individual parameter"], noise_variance: Float[np.ndarray, " signal"]
+) -> Workbench:
+    """Return the bench at a step at which simulations of some points are as good as exact; itself if it is there.
+
+    Readings that no such step knows are no longer measured.
+    """
+    problem = arithmetic.settled(
+        bench.problem, lambda substeps: bench.simulated(points, substeps=substeps), noise_variance
+    )
+    return bench if problem is bench.problem else replace(bench, problem=problem)
 
 
 def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:

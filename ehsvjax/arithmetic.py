@@ -1,0 +1,124 @@
+"""How far a simulation's own arithmetic is off, measured at every reading against the noise there.
+
+A trajectory is stepped again at half and at a quarter of its step; what changes is the error of the first (Richardson
+1911). Where an output all but jumps (a load pressure as the spool leaves its dead zone), no step of useful length knows
+the few readings beside the jump: they carry no weight, as if they were missing. Where too many are off, the step is
+halved. What is left in doubt is worth so little that no comparison of two explanations rests on it.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ehsvjax.population import Problem, cast, simulated
+
+# Noise variances that the arithmetic of one simulation may be worth: two of them then differ by .3 at most in 5 records
+# of noise out of 6, and hardly ever by one.
+_WORTH = 0.01
+# Share of the readings that are left out before the step is halved.
+_LEFT_OUT = 0.02
+# Of the outputs' own deviation: a noise below this is none that a sensor has, and no arithmetic is asked for it.
+_LEAST_NOISE = 1e-4
+# Parts of the step that a model asks for, below which no step is tried.
+_FINEST = 64
+
+OutputsAt = Callable[[int], Float[np.ndarray, "individual record time signal"]]
+"""Outputs of some simulations at so many integration steps per sample."""
+
+
+class Arithmetic(NamedTuple):
+    """The step that a simulation needs, and what it does not know even then.
+
+    Attributes:
+        substeps: integration steps per sample.
+        known: `[record, time, signal]` readings of which the simulation knows what it would show.
+        worth: noise variances by which all other readings' sum of squares is off.
+
+    """
+
+    substeps: int
+    known: Bool[np.ndarray, "record time signal"]
+    worth: float
+
+
+def outputs_of(
+    problem: Problem, individual: Float[np.ndarray, " parameter"]
+) -> Float[np.ndarray, "record time signal"]:
+    """Return the outputs of one individual, in their units, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(_outputs(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
+
+
+_outputs = jax.jit(simulated)
+
+
+def settled_at(problem: Problem, individual: Float[np.ndarray, " parameter"]) -> Problem:
+    """Return the problem settled for one individual, under its own noise."""
+    return settled(problem, _outputs_at(problem, individual), problem.noise_variance)
+
+
+def arithmetic_at(problem: Problem, individual: Float[np.ndarray, " parameter"]) -> Arithmetic:
+    """Return what the arithmetic of one individual needs, under the problem's own noise."""
+    return arithmetic(problem, _outputs_at(problem, individual), problem.noise_variance)
+
+
+def _outputs_at(problem: Problem, individual) -> OutputsAt:
+    return lambda substeps: outputs_of(replace(problem, substeps=np.int32(substeps)), individual)[None]
+
+
+def settled(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np.ndarray, " signal"]) -> Problem:
+    """Return the problem at a step at which some simulations are as good as exact; itself if it is there already.
+
+    Readings that no such step knows are no longer measured.
+    """
+    found = arithmetic(problem, outputs_at, noise_variance)
+    if found.substeps == problem.substeps and np.array_equal(found.known, problem.samples.measured):
+        return problem
+    known = problem.samples._replace(measured=found.known)
+    return replace(problem, samples=known, substeps=np.int32(found.substeps))
+
+
+def arithmetic(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np.ndarray, " signal"]) -> Arithmetic:
+    """Return the step at which some simulations are as good as exact, for all of them together.
+
+    Args:
+        problem: what is simulated; the step is not made longer than it is there.
+        outputs_at: simulates, in the outputs' units.
+        noise_variance: of each output, in its unit squared.
+
+    """
+    readings, measured, here = problem.samples.outputs, problem.samples.measured, int(problem.substeps)
+    spread = np.array([np.var(readings[..., i][measured[..., i]]) for i in range(readings.shape[-1])])
+    variance = np.maximum(noise_variance, _LEAST_NOISE**2 * spread)
+    count = int(measured.sum())
+    found: dict[int, np.ndarray] = {}
+
+    def at(steps: int) -> Float[np.ndarray, "individual record time signal"]:
+        if steps not in found:
+            found[steps] = outputs_at(steps)
+        return found[steps]
+
+    while True:
+        off = np.maximum(*(np.max(np.abs(at(k * here) - at(here)), axis=0) for k in (2, 4)))
+        # Comparisons of a failed simulation with anything are NaN: nothing is known there.
+        squares = np.where(np.isfinite(off), off**2, np.inf)[measured] / np.broadcast_to(variance, off.shape)[measured]
+        order = np.argsort(squares)
+        below = np.cumsum(squares[order])
+        kept = int(np.searchsorted(below, _WORTH, side="right"))
+        if count - kept <= _LEFT_OUT * count:
+            break
+        if 2 * here > _FINEST * problem.grid.substeps:
+            # Arithmetic is worth more than it should be everywhere: to leave out some of it would hide that.
+            kept = count
+            break
+        here *= 2
+    known = np.zeros(count, bool)
+    known[order[:kept]] = True
+    everywhere = measured.copy()
+    everywhere[measured] = known
+    return Arithmetic(here, everywhere, float(below[kept - 1]) if kept else 0.0)
