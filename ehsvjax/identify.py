@@ -252,7 +252,7 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
             before = problem
             if reweigh:
                 problem = replace(problem, noise_variance=_residual_variance(problem, refined.residuals[best]))
-            known = settled_at(problem, refined.individual[best])
+            known = settled_at(problem, np.asarray(refined.individual[best]))
             weighed = not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)
             if known is problem and weighed:
                 break

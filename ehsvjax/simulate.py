@@ -167,10 +167,15 @@ def scan_model(
 
     step = equations.stepper(parameters, sample_period / grid.substeps, signal)
     state = equations.start(parameters, initial, named(inputs[0]))
-    # A state may start from Python numbers or from a float32 constant; the loop needs one type throughout.
-    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, inputs.dtype), state)
+    # A state may start from Python numbers or from a float32 constant; the loop needs one type throughout. A count
+    # stays one.
+    state = jax.tree.map(lambda leaf: leaf if _is_count(leaf) else jnp.asarray(leaf, inputs.dtype), state)
     step = repeated(step, grid.substeps)
     return scan_samples(step, state, visit_state, carry, (inputs, following, samples), inputs_of, scan)
+
+
+def _is_count(leaf) -> bool:
+    return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jnp.integer)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))

@@ -16,9 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ehsvjax import arithmetic
-from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates
+from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates, input_named
 from ehsvjax.effects.extended import disturbance, extended
 from ehsvjax.effects.internal import Internal, internal_signals
+from ehsvjax.effects.of_model import effects_for
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import Problem, cast, simulated, to_unit, to_values
@@ -166,7 +167,7 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
     model = fit.model
     initial = fit.initial_of(record)
     internal = internal_signals(model, record, fit.parameters, initial)
-    found = candidates(model, bank, internal.contexts, tuple(record.outputs))
+    found = candidates(model, (*bank, *effects_for(model)), internal.contexts, tuple(record.outputs))
     scales = {c.name: _scales(c, internal, record) for c in found}
     places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
     duration = len(record) * record.sample_period
@@ -223,7 +224,7 @@ def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
 
     signal = candidate.signal
     value = record.inputs.get(signal, internal.values.get(signal, np.ones(1)))
-    context = {}
+    context = {input_named(name): largest(series) for name, series in record.inputs.items()}
     for name, series in internal.contexts.get(signal, {}).items():
         context[name] = largest(series)
         context |= {f"{name}{sign}": largest(np.maximum(side * series, 0.0)) for sign, side in (("+", 1), ("-", -1))}

@@ -3,11 +3,22 @@
 from ehsvjax.effects.attach import attach
 from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, amplitude, candidates, limit, shape, size, width
 from ehsvjax.effects.extended import effects_of, extended
-from ehsvjax.effects.forces import FORCE, FRICTION, LOAD
+from ehsvjax.effects.forces import FORCE, FRICTION, LOAD, STORAGE
 from ehsvjax.effects.series import INPUT, SENSOR
 from ehsvjax.effects.valve import DAMPING, DISPLACEMENT, DRIFT, VALVE
 
-BANK: tuple[Effect, ...] = (*INPUT, *SENSOR, *FORCE, *LOAD, *FRICTION, *VALVE, *DAMPING, *DISPLACEMENT, *DRIFT)
+BANK: tuple[Effect, ...] = (
+    *INPUT,
+    *SENSOR,
+    *FORCE,
+    *LOAD,
+    *FRICTION,
+    *STORAGE,
+    *VALVE,
+    *DAMPING,
+    *DISPLACEMENT,
+    *DRIFT,
+)
 """Every effect of this package; `diagnose(..., bank=(*BANK, my_effect))` adds one of yours."""
 
 __all__ = [

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from ehsvjax.effects.effect import Candidate, Effect, candidates
 from ehsvjax.effects.extended import DURATION, extended
 from ehsvjax.effects.internal import contexts_of
+from ehsvjax.effects.of_model import effects_for
 from ehsvjax.models.model import Model, Parameter, as_bounds, check_bounds
 
 
@@ -36,6 +37,7 @@ def attach(
         raise ValueError(
             "expected bounds of an effect's numbers, such as {'sensor_bias.bias': (-1e-3, 1e-3)}; got none"
         )
+    bank = (*bank, *effects_for(model))
     possible = candidates(model, bank, contexts_of(model), model.outputs)
     attached: dict[Candidate, dict[str, tuple[float, float]]] = {}
     for name in bounds:

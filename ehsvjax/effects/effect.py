@@ -11,6 +11,12 @@ Scales = Mapping[str, Any]
 context by name (0 where nothing is known), with `+` or `-` behind the name how far it goes on that side; `duration` and
 `sample_period` in s, and `frequencies` in rad/s at which a harmonic effect would explain most."""
 
+
+def input_named(name: str) -> str:
+    """Return the name of an input's value in the context of a sensor."""
+    return f"input {name}"
+
+
 ALWAYS = ("time", "step_size", "duration")
 """Quantities that every effect's context has."""
 UNLIMITED = 1e30
@@ -46,7 +52,8 @@ class Effect:
 
     Attributes:
         name: in the field's terms, `transport_delay`.
-        kind: of the signals at which it can act, `Signal.kind`; or "parameter", for the value of a free parameter.
+        kind: of the signals at which it can act, `Signal.kind`; "parameter", for the value of a free parameter as time
+            passes; or "constant", for a constant that may have been given wrong.
         parameters: its own numbers.
         apply: `apply(own, value, context)` returns the disturbed value; `own` are its numbers by name, `context` what
             the model passes with the signal and `time` s, `step_size` s, `duration` s of the record. With a memory:
@@ -104,9 +111,10 @@ class Candidate(NamedTuple):
 
     def unit(self, number: EffectParameter, model: Model) -> str:
         """Unit of one of the effect's numbers; none where the model is dimensionless at the signal."""
-        at_parameter = self.effect.kind == "parameter"
+        at_parameter = self.effect.kind in ("parameter", "constant")
         unit = model.parameter(self.signal).unit if at_parameter else model.unit(self.signal)
-        return "" if "{value}" in number.unit and not unit else number.unit.replace("{value}", unit)
+        found = "" if "{value}" in number.unit and not unit else number.unit.replace("{value}", unit)
+        return found.replace("/s s", "")
 
 
 def candidates(
@@ -124,13 +132,13 @@ def candidates(
         observed: the outputs that are measured: an effect on the sensor of another could not show.
 
     """
+    inputs = {input_named(name) for name in model.inputs}
 
     def takes(effect, signal):
         if signal.kind != effect.kind or (signal.kind == "sensor" and signal.name not in observed):
             return False
-        return signal.kind == "input" or (
-            signal.name in contexts and set(effect.needs) <= {*contexts[signal.name], *ALWAYS}
-        )  # fmt: skip
+        there = {*contexts.get(signal.name, ()), *ALWAYS, *(inputs if signal.kind == "sensor" else ())}
+        return signal.kind == "input" or (signal.name in contexts and set(effect.needs) <= there)
 
     # A valve's flow gain drifts at its opening; to let its other parameters drift, its transfer function would have
     # to be set up anew at every step.
@@ -138,7 +146,8 @@ def candidates(
     drifting = [] if any(s.kind == "opening" for s in model.signals) else own
     found = []
     for effect in bank:
-        places = drifting if effect.kind == "parameter" else [s.name for s in model.signals if takes(effect, s)]
+        elsewhere = {"parameter": drifting, "constant": [effect.name]}
+        places = elsewhere.get(effect.kind) or [s.name for s in model.signals if takes(effect, s)]
         found += [(effect, place) for place in places]
     places_of: dict[str, set[str]] = {}
     for effect, place in found:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import Candidate
+from ehsvjax.effects.effect import Candidate, input_named
 from ehsvjax.models.model import Equations, Model, Parameter, Signal, identity
 
 DURATION = "record_duration"
@@ -15,9 +15,13 @@ DURATION = "record_duration"
 
 
 class ExtendedState(NamedTuple):
-    """The model's own state, the time since the record's start, and the effects' memories by their names."""
+    """The model's own state, the steps and the time since the record's start, and the effects' memories by their names.
+
+    The time is that of the steps taken: added up in single precision it would be a percent off after some minutes.
+    """
 
     state: Any
+    steps: Any
     time: Any
     memories: dict[str, Any]
 
@@ -45,7 +49,7 @@ def extended(
     """
     equations = _equations(model.equations, tuple(attached), tuple(disturbed))
     constants = () if any(p.name == DURATION for p in model.parameters) else (
-        Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True),
+        Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True, certain=True),
     )  # fmt: skip
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
     # An end stop on either side is the same effect twice.
@@ -78,6 +82,7 @@ def effects_of(model: Model) -> tuple[str, ...]:
 def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[str, ...]) -> Equations:
     """Return the equations with effects, the same objects for the same effects."""
     inputs = tuple(c for c in attached if c.effect.kind == "input")
+    given_wrong = tuple(c for c in attached if c.effect.kind == "constant")
     drifting = tuple(c for c in attached if c.effect.kind == "parameter")
     remembering = tuple(c for c in attached if c.effect.memory and c.effect.kind != "input")
     sensing = {c.name for c in remembering if c.signal in base.outputs}
@@ -85,7 +90,7 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     names = (*base.inputs, *(disturbance(place) for place in places))
     at_signal: dict[str, list[Candidate]] = {}
     for candidate in attached:
-        if candidate.effect.kind not in ("input", "parameter"):
+        if candidate.effect.kind not in ("input", "parameter", "constant"):
             at_signal.setdefault(candidate.signal, []).append(candidate)
 
     def own_of(candidate, parameters):
@@ -100,6 +105,8 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             if name in moment.added:
                 value = value + moment.added[name]
             context |= {"duration": parameters[DURATION], "time": moment.time, "step_size": moment.step_size}
+            if name in base.outputs:
+                context |= {input_named(key): held for key, held in moment.values.items()}
             for candidate in at_signal.get(name, ()):
                 own = own_of(candidate, parameters)
                 if not candidate.effect.memory:
@@ -111,6 +118,12 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
 
         return disturbed
 
+    def corrected(parameters):
+        changed = dict(parameters)
+        for c in given_wrong:
+            changed[c.signal] = c.effect.apply(own_of(c, parameters), changed[c.signal], {})
+        return changed
+
     def drifted(parameters, time):
         if not drifting:
             return parameters
@@ -121,14 +134,16 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
         return changed
 
     def start(parameters, initial, series):
+        parameters = corrected(parameters)
         state = base.start(parameters, initial, series)
         memories = {c.name: tuple(jnp.asarray(m) for m in c.effect.memory) for c in remembering}
-        moment = _Moment(0.0, 0.0, memories, sensing)
+        moment = _Moment(0.0, 0.0, memories, sensing, values=series)
         if sensing:
             base.measure(parameters, state, series, disturbing(parameters, identity, [moment]))
-        return ExtendedState(state, 0.0, moment.memories)
+        return ExtendedState(state, jnp.int32(0), 0.0, moment.memories)
 
     def stepper(parameters, step_size, signal):
+        parameters = corrected(parameters)
         # Without drifts what does not change is computed once; signals outside the time loop have no memory.
         outside = _Moment(0.0, step_size, {}, set())
         current = [outside]
@@ -142,21 +157,23 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             now = drifted(parameters, state.time)
             once = base.stepper(now, step_size, disturbed) if steady is None else steady
             following = once(state.state, series)
-            time = state.time + step_size
+            time = (state.steps + 1) * step_size
             if sensing:
-                current[0] = _Moment(time, step_size, current[0].memories, sensing)
+                current[0] = _Moment(time, step_size, current[0].memories, sensing, values=series(1.0))
                 base.measure(now, following, series(1.0), disturbed)
-            return ExtendedState(following, time, current[0].memories)
+            return ExtendedState(following, state.steps + 1, time, current[0].memories)
 
         return step
 
     def measure(parameters, state, series, signal):
         # The memories have moved on to this moment: no time is left for them to do so.
-        moment = _Moment(state.time, 0.0, state.memories, set())
+        parameters = corrected(parameters)
+        moment = _Moment(state.time, 0.0, state.memories, set(), values=series)
         disturbed = disturbing(parameters, signal, [moment])
         return base.measure(drifted(parameters, state.time), state.state, series, disturbed)
 
     def prepare(parameters, series, sample_period):
+        parameters = corrected(parameters)
         series = series if base.prepare is None else base.prepare(parameters, series, sample_period)
         time = sample_period * jnp.arange(series.shape[0], dtype=series.dtype)
         context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
@@ -173,9 +190,9 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
 class _Moment:
     """The time and the memories at one moment, while a step is traced; a signal's first call moves its memory on."""
 
-    def __init__(self, time, step_size, memories, moving, added=None):
+    def __init__(self, time, step_size, memories, moving, added=None, values=None):
         self.time, self.step_size, self.memories, self._moving = time, step_size, dict(memories), set(moving)
-        self.added = added or {}
+        self.added, self.values = added or {}, values or {}
 
     def remember(self, name, memory):
         if name in self._moving:

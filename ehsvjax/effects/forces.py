@@ -1,4 +1,4 @@
-"""Effects on forces: friction, stiffness, constant and harmonic ones, in the signs of a driving force or a load."""
+"""Effects on forces and on what is stored: friction, stiffness, stops; in the signs of a driving force or a load."""
 
 import functools
 
@@ -54,17 +54,15 @@ def _cubic(own, context):
     return own["coefficient"] * context["position"] ** 3
 
 
-def _harmonic(own, context):
+def harmonic(own, context):
+    """Return the negative of a harmonic of time: as a force it drives, as a load it resists."""
     angle = own["frequency"] * context["time"]
     return -(own["cosine"] * jnp.cos(angle) + own["sine"] * jnp.sin(angle))
 
 
-def _harmonic_parameters(unit):
-    return (
-        amplitude("cosine", unit, constant(_PROBE)),
-        amplitude("sine", unit, constant(_PROBE)),
-        _FREQUENCY,
-    )
+def harmonic_parameters(unit, probe):
+    """Return the numbers of a harmonic: its two amplitudes, and a frequency that is looked for in the record."""
+    return amplitude("cosine", unit, probe), amplitude("sine", unit, probe), _FREQUENCY
 
 
 def _stribeck_shape(scales: Scales):
@@ -106,6 +104,31 @@ def _stop(side):
         settled_by="move to the end by hand, with a gauge: a stop stops the load, a sensor's end does not",
     )
 
+
+def _hard_limit(side):
+    """Return the end, on one side, of what is stored: its rate of change stops there, and is lost."""
+    sign, there, opposite = ("positive", "level+", "level-") if side > 0 else ("negative", "level-", "level+")
+    number = f"{sign}_limit"
+
+    def apply(own, rate, context):
+        return jnp.where(side * context["level"] >= own[number], side * jnp.minimum(side * rate, 0.0), rate)
+
+    end = EffectParameter(
+        number, "{value} s", UNLIMITED, lambda s: -s[opposite], lambda s: 1.02 * s[there],
+        lambda s: [share * s[there] - (1.0 - share) * s[opposite] for share in (0.98, 0.9, 0.75)],
+    )  # fmt: skip
+    return Effect(
+        "hard_limit",
+        "storage",
+        (end,),
+        apply,
+        needs=("level",),
+        says=f"what is stored ends on the {sign} side: it overflows, or stands at its stop",
+        settled_by="look there while it happens, or measure what is stored",
+    )
+
+
+STORAGE = (_hard_limit(1.0), _hard_limit(-1.0))
 
 _MEASURE_PRESSURE = "measure the load pressure"
 _TWO_AMPLITUDES = "two amplitudes, and free decay"
@@ -154,8 +177,8 @@ LOAD = (
     ),
     _load(
         "harmonic_load",
-        _harmonic_parameters("{value}"),
-        _harmonic,
+        harmonic_parameters("{value}", constant(_PROBE)),
+        harmonic,
         says="a periodic force on the piston",
         settled_by="a record at rest: a hum of the sensor is there too, a load on a closed valve is not",
     ),
@@ -246,20 +269,16 @@ FORCE = (
     ),
     _force(
         "harmonic_force",
-        _harmonic_parameters("{value}"),
-        _harmonic,
+        harmonic_parameters("{value}", constant(_PROBE)),
+        harmonic,
         needs=(),
         says="a periodic force",
         settled_by="a record at rest",
     ),
     _force(
         "parametric_excitation",
-        (
-            amplitude("cosine", "{value}/m", _per("position", 1)),
-            amplitude("sine", "{value}/m", _per("position", 1)),
-            _FREQUENCY,
-        ),
-        lambda own, context: -_harmonic(own, context) * context["position"],
+        harmonic_parameters("{value}/m", _per("position", 1)),
+        lambda own, context: -harmonic(own, context) * context["position"],
         needs=("position",),
         says="a stiffness that changes periodically",
         settled_by="records at two amplitudes: a force does not grow with them, a stiffness does",

@@ -42,6 +42,13 @@ def _delayed(own, series, context):
     return (1.0 - part) * earlier(at) + part * earlier(at - 1)
 
 
+def _between_steps(own, series, context):
+    """Mean over each sample of an input that runs from value to value instead of in steps: for share 1 straight."""
+    del context
+    following = jnp.concatenate([series[1:], series[-1:]])
+    return series + 0.5 * own["share"] * (following - series)
+
+
 def _lagged(own, series, context):
     """First-order lag, the mean over each sample of what follows the held series; at rest before the record."""
     ratio = context["sample_period"] / jnp.maximum(own["time_constant"], 1e-6 * context["sample_period"])
@@ -107,6 +114,14 @@ INPUT = (
         _delayed,
         says="the input acts later",
         settled_by="a multisine of 5-40 Hz at two amplitudes: a delay turns the phase in proportion to frequency",
+    ),
+    Effect(
+        "input_hold",
+        "input",
+        (amplitude("share", "", constant(1e-2), constant(-1.0), constant(2.0)),),
+        _between_steps,
+        says="the input runs otherwise between samples than it is said to: by half a sample for a share of one",
+        settled_by="declare how the input runs between samples (hold), or measure it at ten times the rate",
     ),
     Effect(
         "input_lag",

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 
 from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, limit, size, width
+from ehsvjax.effects.forces import harmonic, harmonic_parameters
 from ehsvjax.effects.series import dead_zone, follow_with_play
 
 _TRIANGLES = "small triangles at three rates and amplitudes"
@@ -122,6 +123,14 @@ VALVE = (
         needs=("flow",),
         says="the supply pressure gives way under flow",
         settled_by="measure the supply pressure",
+    ),
+    Effect(
+        "supply_pulsation",
+        "supply",
+        harmonic_parameters("{value}", lambda s: 1e-3 * s["value"]),
+        lambda own, pressure, context: pressure - harmonic(own, context),
+        says="the supply pressure pulsates",
+        settled_by="measure the supply pressure; a load does not change its sign with the opening, a supply's effect does",
     ),
     Effect(
         "return_pressure",

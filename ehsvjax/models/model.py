@@ -28,7 +28,8 @@ class Parameter(NamedTuple):
 
     `value` is the nominal value, used where the parameter is fixed; `scale` says in which coordinate the search moves:
     "log" for positive quantities known by their order of magnitude. For an initial condition, `output` names the output
-    whose first samples tell about where it lies, if that output is measured.
+    whose first samples tell about where it lies, if that output is measured. A constant is taken to be what it is given
+    as, and may have been given wrong: `diagnose` tries that too, unless it is `certain`.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Parameter(NamedTuple):
     scale: Literal["linear", "log"] = "linear"
     fixed: bool = False
     output: str | None = None
+    certain: bool = False
 
 
 class Signal(NamedTuple):
@@ -47,7 +49,8 @@ class Signal(NamedTuple):
 
     Lines of kind "input" are the model's inputs, lines of kind "sensor" its outputs. The kind says which effects can
     act there (`ehsvjax.effects`): a "force" drives the motion, a "load" resists it, "friction" is the size of a force
-    against the velocity (a model steps it without chatter), a "displacement" is any other length.
+    against the velocity (a model steps it without chatter), "storage" is the rate at which something is stored (its
+    `level=` the context), a "displacement" is any other length.
     """
 
     name: str
