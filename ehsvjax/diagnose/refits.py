@@ -132,15 +132,17 @@ def refit(
             # A NaN is no improvement, nor is a place that is so steep that nothing can be told from there.
             if value < cost[i] and np.max(np.abs(jacobian), initial=0.0) < _STEEPEST:
                 points[i], cost[i] = trial[i], value
-                kept[i] = _Here(residual[row], slopes[:, row], whitened[row], jacobian, jacobian @ jacobian.T)
+                kept[i] = _Here(
+                    residual[row], slopes[:, row], jacobian, jacobian @ whitened[row], jacobian @ jacobian.T
+                )
                 damping[i], growth[i] = 0.1 * damping[i], 2.0
             else:
                 damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
-            if kept[i] is None:
+            here = kept[i]
+            if here is None:
                 running[i] = False
                 continue
-            gradient = kept[i].jacobian @ kept[i].whitened
-            step, gain = _step(points[i], chosen[i], gradient, kept[i].information, damping[i], lower, upper)
+            step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
             if gain < 0.01 * max(cost[i] / whitened.shape[1], 1e-300):
                 converged[i] = True
                 running[i] = False
@@ -161,12 +163,12 @@ def refit(
 
 
 class _Here(NamedTuple):
-    """What is known at the best point of a start; the last three whitened."""
+    """What is known at the best point of a start; from the jacobian on whitened."""
 
     residual: Float[np.ndarray, "record time signal"]
     slopes: Float[np.ndarray, "direction record time signal"]
-    whitened: Float[np.ndarray, " sample"]
     jacobian: Float[np.ndarray, "direction sample"]
+    gradient: Float[np.ndarray, " direction"]
     information: Float[np.ndarray, "direction direction"]
 
 
@@ -178,6 +180,7 @@ def _bend(bench, white, trial, running, points, chosen, kept, damping, lower, up
     ahead = bench.simulated(points[running] + _AHEAD * steps)
     for row, i in enumerate(running):
         here, own = kept[i], np.maximum(chosen[i], 0)
+        assert here is not None
         along = np.where(chosen[i] >= 0, steps[row][own], 0.0)
         changed = white(ahead[row] - (bench.problem.samples.outputs - here.residual))
         curvature = 2.0 / _AHEAD * (changed / _AHEAD - along @ here.jacobian)

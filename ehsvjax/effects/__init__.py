@@ -7,18 +7,8 @@ from ehsvjax.effects.forces import FORCE, FRICTION, LOAD, STORAGE
 from ehsvjax.effects.series import INPUT, SENSOR
 from ehsvjax.effects.valve import DAMPING, DISPLACEMENT, DRIFT, VALVE
 
-BANK: tuple[Effect, ...] = (
-    *INPUT,
-    *SENSOR,
-    *FORCE,
-    *LOAD,
-    *FRICTION,
-    *STORAGE,
-    *VALVE,
-    *DAMPING,
-    *DISPLACEMENT,
-    *DRIFT,
-)
+_MECHANICS = (*FORCE, *LOAD, *FRICTION, *STORAGE)
+BANK: tuple[Effect, ...] = (*INPUT, *SENSOR, *_MECHANICS, *VALVE, *DAMPING, *DISPLACEMENT, *DRIFT)
 """Every effect of this package; `diagnose(..., bank=(*BANK, my_effect))` adds one of yours."""
 
 __all__ = [

@@ -57,14 +57,8 @@ def _there(parameter: Parameter) -> Effect:
     """Return the effect of a constant that was given as zero and is not."""
     largest = max(abs(parameter.lower), abs(parameter.upper))
     lower = constant(parameter.lower if parameter.lower < 0.0 else 0.0)
-    number = EffectParameter(
-        "value",
-        "{value}",
-        0.0,
-        lower,
-        constant(largest),
-        lambda scales: (1e-4 * largest, 1e-2 * largest, 0.3 * largest),
-    )
+    tries = [share * largest for share in (1e-4, 1e-2, 0.3)]
+    number = EffectParameter("value", "{value}", 0.0, lower, constant(largest), lambda scales: tries)
     return Effect(
         parameter.name,
         "constant",

@@ -130,7 +130,7 @@ VALVE = (
         harmonic_parameters("{value}", lambda s: 1e-3 * s["value"]),
         lambda own, pressure, context: pressure - harmonic(own, context),
         says="the supply pressure pulsates",
-        settled_by="measure the supply pressure; a load does not change its sign with the opening, a supply's effect does",
+        settled_by="measure the supply pressure: what it does changes its sign with the opening, what a load does not",
     ),
     Effect(
         "return_pressure",
