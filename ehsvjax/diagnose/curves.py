@@ -168,11 +168,10 @@ def knots_along(series: Float[np.ndarray, " time"], pieces: int) -> Float[np.nda
 
 
 def probe_at(bench: Workbench, place: str) -> float:
-    """Return the size of a small disturbance at a place: a share of its value where it has one."""
+    """Return the size of a small disturbance at a place: of its unit, or a share of an opening."""
     if _is_opening(bench, place) or place in bench.problem.observed:
         return _PROBE
-    largest = float(np.max(np.abs(bench.internal.values[place])))
-    return _PROBE * largest if largest > 0 else _PROBE
+    return bench.probes[place]
 
 
 def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[np.ndarray, "piece record time signal"]:

@@ -9,7 +9,6 @@ from ehsvjax.diagnose.workbench import Workbench
 
 _PARTS = 200
 _LEAST_SAMPLES = 10
-_PROBE = 1e-3
 
 
 class Parts(NamedTuple):
@@ -41,7 +40,7 @@ def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: st
     part = np.arange(shape[1]) * count // shape[1]
     added = np.zeros((count + 1, *shape[:2], len(bench.places)))
     for k in range(count):
-        added[k + 1, :, part == k, bench.places.index(place)] = _PROBE
+        added[k + 1, :, part == k, bench.places.index(place)] = count * bench.probes[place]
     outputs = bench.simulated(np.repeat(point[None], count + 1, axis=0), added)
     length = shape[1] / count * float(bench.problem.samples.sample_period[0])
-    return Parts(place, part, length, (outputs[1:] - outputs[0]) / _PROBE)
+    return Parts(place, part, length, (outputs[1:] - outputs[0]) / (count * bench.probes[place]))

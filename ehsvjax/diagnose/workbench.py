@@ -6,7 +6,7 @@ of the initial conditions. What is tried differs in its data only, so that nothi
 
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -31,7 +31,9 @@ PLACES = ("force", "load", "opening", "supply", "damping", "displacement")
 # Simulated side by side: so few that a handful of points keeps all cores busy.
 _ABREAST = 8
 # Of coordinates, for derivatives. An effect's size may count so little in its own that rounding would drown it.
-_DIFFERENCE, _DIFFERENCE_OF_SIZE = 1e-6, 1e-4
+_DIFFERENCE, _DIFFERENCE_OF_SIZE = 1e-6, 1e-3
+# Share of what runs along a signal that is tried first, and by which a probe then moves the outputs.
+_PROBE, _MOVED = 1e-3, 1e-4
 # Of the outputs: less is rounding.
 _ROUNDING = 3e-14
 TOLD_APART = 3e-5
@@ -50,6 +52,7 @@ class Workbench:
         scales: of each candidate.
         internal: what runs along the nominal model's signals.
         places: signals that can be disturbed by a series.
+        probes: place -> a disturbance, in the signal's unit, that moves the outputs by a little.
         disturbances: `[record, time, place]` what is added to them in every simulation; nothing at first.
         column: name of an unknown -> its column; initial conditions are `name[record]`.
         nominal: `[parameter]` the point at which every effect is absent.
@@ -64,6 +67,7 @@ class Workbench:
     scales: dict[str, Scales]
     internal: Internal
     places: tuple[str, ...]
+    probes: dict[str, float]
     disturbances: Float[np.ndarray, "record time place"]
     column: dict[str, int]
     nominal: Float[np.ndarray, " parameter"]
@@ -156,7 +160,7 @@ class Workbench:
 
 
 def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
-    """Set up the trials of a fit on a record; nothing is compiled for them yet.
+    """Set up the trials of a fit on a record.
 
     Args:
         fit: of the nominal model.
@@ -164,12 +168,37 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
         bank: the candidate effects.
 
     """
+    # How much a force moves depends on the machine: on a larger one a probe of any fixed size is lost in rounding.
+    bench = _bench(fit, record, bank, {})
+    bench = _bench(fit, record, bank, _calibrated(bench))
+    return settled(bench, bench.nominal[None], bench.problem.noise_variance)
+
+
+def _calibrated(bench: Workbench) -> dict[str, float]:
+    """Return for each place the disturbance that, held, moves some output by `_MOVED` of its size."""
+    points = np.repeat(bench.nominal[None], 1 + len(bench.places), axis=0)
+    added = np.zeros((len(points), *bench.disturbances.shape))
+    for k, place in enumerate(bench.places):
+        added[1 + k, ..., k] = bench.probes[place]
+    outputs = bench.simulated(points, added)
+    size = np.maximum(np.std(outputs[0], axis=(0, 1)), 1e-300)
+    moved = np.max(np.std(outputs[1:] - outputs[0], axis=(1, 2)) / size, axis=1)
+    return {
+        place: bench.probes[place] * (_MOVED / by if np.isfinite(by) and by > _ROUNDING else 1.0)
+        for place, by in zip(bench.places, moved, strict=True)
+    }
+
+
+def _bench(fit: Fit, record: Record, bank: Sequence[Effect], probes: Mapping[str, float]) -> Workbench:
+    """Return the bench before its step is settled, with the probes that are known."""
     model = fit.model
     initial = fit.initial_of(record)
     internal = internal_signals(model, record, fit.parameters, initial)
     found = candidates(model, (*bank, *effects_for(model)), internal.contexts, tuple(record.outputs))
-    scales = {c.name: _scales(c, internal, record) for c in found}
     places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
+    probes = {place: _probe(internal.values[place]) for place in places} | dict(probes)
+    forces = [s.name for s in model.signals if s.kind in ("force", "load") and s.name in places]
+    scales = {c.name: _scales(c, internal, record, probes, forces) for c in found}
     duration = len(record) * record.sample_period
     numbers = {c.parameter(p.name): _free(c, p, model, scales[c.name]) for c in found for p in c.effect.parameters}
     full = extended(model, found, numbers, duration, places)
@@ -201,8 +230,13 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
             one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
             nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
     nothing = np.zeros((1, len(record), len(places)))
-    bench = Workbench(fit, full, problem, found, scales, internal, places, nothing, column, nominal, differences)
-    return settled(bench, nominal[None], problem.noise_variance)
+    return Workbench(fit, full, problem, found, scales, internal, places, probes, nothing, column, nominal, differences)
+
+
+def _probe(values: Float[np.ndarray, " time"]) -> float:
+    """Return a small part of what runs along a signal, or a small number where nothing does."""
+    largest = float(np.max(np.abs(values)))
+    return _PROBE * largest if 0.0 < largest < np.inf else _PROBE
 
 
 def settled(
@@ -218,7 +252,9 @@ def settled(
     return bench if problem is bench.problem else replace(bench, problem=problem)
 
 
-def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
+def _scales(
+    candidate: Candidate, internal: Internal, record: Record, probes: Mapping[str, float], forces: Sequence[str]
+) -> Scales:
     def largest(series):
         return float(np.max(np.abs(series))) if np.all(np.isfinite(series)) else 0.0
 
@@ -231,6 +267,7 @@ def _scales(candidate: Candidate, internal: Internal, record: Record) -> Scales:
     return {
         **context,
         "value": largest(value),
+        "probe": next((probes[place] for place in (signal, *forces) if place in probes), _PROBE),
         "duration": len(record) * record.sample_period,
         "sample_period": record.sample_period,
         # Where the search begins; it goes where a residual leads it.

@@ -6,14 +6,17 @@ import jax.numpy as jnp
 
 from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, amplitude, constant, shape, size
 
-# A force has no size that could be known before it was tried: probes are this large, SI, and taken to be linear.
-_PROBE = 1e-3
 # Of an end stop, N/m: at most what an explicit force bears at a quarter of a millisecond.
 _STOP_STIFFNESS, _SOFTEST, _STIFFEST = (1e7, 3e7, 1e8), 1e6, 3e8
 
 
+def _probe(scales: Scales) -> float:
+    """Return a force that moves the machine a little, which is known only once one was tried."""
+    return scales["probe"]
+
+
 def _per(quantity: str, power: int):
-    return lambda scales: _PROBE / max(scales[quantity], 1e-300) ** power
+    return lambda scales: _probe(scales) / max(scales[quantity], 1e-300) ** power
 
 
 _FREQUENCY = shape(
@@ -71,7 +74,7 @@ def _stribeck_shape(scales: Scales):
 
 def _stribeck_parameters(unit):
     return (
-        size("force", unit, constant(_PROBE)),
+        size("force", unit, _probe),
         shape("velocity", "m/s", _stribeck_shape, lambda s: 1e-3 * s["velocity"], lambda s: 0.5 * s["velocity"]),
     )
 
@@ -137,7 +140,7 @@ FRICTION = (
     Effect(
         "coulomb_friction",
         "friction",
-        (size("force", "{value}", constant(_PROBE)),),
+        (size("force", "{value}", _probe),),
         lambda own, value, context: value + own["force"],
         says="dry friction of constant size",
         settled_by=_MEASURE_PRESSURE,
@@ -156,7 +159,7 @@ FRICTION = (
 LOAD = (
     _load(
         "constant_load",
-        (amplitude("force", "{value}", constant(_PROBE)),),
+        (amplitude("force", "{value}", _probe),),
         lambda own, context: own["force"],
         says="a constant force on the piston",
         settled_by=f"half the supply pressure; or {_MEASURE_PRESSURE}",
@@ -177,7 +180,7 @@ LOAD = (
     ),
     _load(
         "harmonic_load",
-        harmonic_parameters("{value}", constant(_PROBE)),
+        harmonic_parameters("{value}", _probe),
         harmonic,
         says="a periodic force on the piston",
         settled_by="a record at rest: a hum of the sensor is there too, a load on a closed valve is not",
@@ -189,7 +192,7 @@ LOAD = (
 FORCE = (
     _force(
         "constant_force",
-        (amplitude("force", "{value}", constant(_PROBE)),),
+        (amplitude("force", "{value}", _probe),),
         lambda own, context: -own["force"],
         needs=(),
         says="a constant force",
@@ -197,7 +200,7 @@ FORCE = (
     ),
     _force(
         "coulomb_friction",
-        (size("force", "{value}", constant(_PROBE)),),
+        (size("force", "{value}", _probe),),
         lambda own, context: own["force"] * _sign(context["velocity"]),
         needs=("velocity",),
         says="dry friction of constant size",
@@ -269,7 +272,7 @@ FORCE = (
     ),
     _force(
         "harmonic_force",
-        harmonic_parameters("{value}", constant(_PROBE)),
+        harmonic_parameters("{value}", _probe),
         harmonic,
         needs=(),
         says="a periodic force",
