@@ -9,8 +9,8 @@ from ehsvjax.models.model import Model
 Scales = Mapping[str, Any]
 """How large things are in a record: `value`, the largest size of the signal itself, and of each quantity of its
 context by name (0 where nothing is known), with `+` or `-` behind the name how far it goes on that side; `duration` and
-`sample_period` in s, `frequencies` in rad/s at which a harmonic effect would explain most, and `probe`, a disturbance of
-a force that moves the machine a little."""
+`sample_period` in s, `frequencies` in rad/s at which a harmonic effect would explain most, and `probe`, a disturbance
+of a force that moves the machine a little."""
 
 
 def input_named(name: str) -> str:

@@ -4,7 +4,7 @@ import functools
 
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, amplitude, constant, shape, size
+from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, amplitude, shape, size
 
 # Of an end stop, N/m: at most what an explicit force bears at a quarter of a millisecond.
 _STOP_STIFFNESS, _SOFTEST, _STIFFEST = (1e7, 3e7, 1e8), 1e6, 3e8
