@@ -31,6 +31,11 @@ OutputsAt = Callable[[int], Float[np.ndarray, "individual record time signal"]]
 """Outputs of some simulations at so many integration steps per sample."""
 
 
+def finest(problem: Problem) -> bool:
+    """Whether a problem is stepped as finely as is tried."""
+    return 2 * int(problem.substeps) > _FINEST * problem.grid.substeps
+
+
 class Arithmetic(NamedTuple):
     """The step that a simulation needs, and what it does not know even then.
 
@@ -112,7 +117,7 @@ def arithmetic(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np
         kept = int(np.searchsorted(below, _WORTH, side="right"))
         if count - kept <= _LEFT_OUT * count:
             break
-        if 2 * here > _FINEST * problem.grid.substeps:
+        if finest(replace(problem, substeps=here)):
             # Arithmetic is worth more than it should be everywhere: to leave out some of it would hide that.
             kept = count
             break

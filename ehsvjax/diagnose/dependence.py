@@ -70,7 +70,7 @@ def strongest_dependence(
 ) -> float:
     """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
     tests, r = _examined(bench, current, white, seen)
-    return max(_explained(test.basis.T @ r) for test in tests)
+    return max((_explained(test.basis.T @ r) for test in tests), default=0.0)
 
 
 class _Test(NamedTuple):

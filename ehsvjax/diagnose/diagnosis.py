@@ -8,6 +8,7 @@ from ehsvjax.diagnose.gain import Gain
 from ehsvjax.diagnose.misfit import Misfit
 from ehsvjax.diagnose.missing import MissingTerm
 from ehsvjax.diagnose.process_noise import ProcessNoise
+from ehsvjax.diagnose.selection import Integration
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
 
@@ -49,6 +50,7 @@ class Diagnosis:
         missing: where something is left, the term that is missing, estimated without a form; where several causes
             were found, the one term that would explain the record as well, if there is one.
         process_noise: the random force that was found, if it is the cause.
+        integration: the step that was needed, and what its arithmetic is worth.
         fit: the fit that was diagnosed.
         record: on which.
 
@@ -66,6 +68,7 @@ class Diagnosis:
     innocent: bool
     missing: MissingTerm | None
     process_noise: ProcessNoise | None
+    integration: Integration
     fit: Fit
     record: Record
 

@@ -76,12 +76,14 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
 
 def _depends(selection: Selection, tests: tuple[Dependence, ...]) -> bool:
     """Whether what is left depends on something, also if it is itself taken for coloured noise."""
-    if tests[0].corrected >= SIGNIFICANT:
+    # Where nothing that a term could do would show, nothing can be told from noise.
+    if not tests or tests[0].corrected >= SIGNIFICANT:
         return False
     own = _own_noise(selection)
     if not own.coloured:
         return True
-    return dependences(selection.bench, selection.final, own, selection.seen)[0].corrected < SIGNIFICANT
+    again = dependences(selection.bench, selection.final, own, selection.seen)
+    return bool(again) and again[0].corrected < SIGNIFICANT
 
 
 def _own_noise(selection: Selection) -> Whitening:
@@ -99,18 +101,19 @@ def _random_force(
     explains it about as well as a single cause.
     """
     bench = selection.bench
-    nominal = process_noise(bench, selection.nominal)
+    used = selection.white.used
+    nominal = process_noise(bench, selection.nominal, used)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
         return None, False
     if selection.included:
-        final = process_noise(bench, selection.final)
+        final = process_noise(bench, selection.final, used)
         assert final is not None
         better = nominal.likelihood - final.of_sensor + _least_price(selection)
         # A single cause that leaves nothing unexplained has the first word.
         single = innocent and len(selection.included) == 1
         if not better > (CONVINCING if single else 0.0):
             return None, bool(single and better > -INSEPARABLE)
-    if before[0].corrected < SIGNIFICANT:
+    if before and before[0].corrected < SIGNIFICANT:
         # A term that depends on what runs along the model is a better reason than chance.
         term = missing_term(bench, selection.nominal, selection.white, selection.seen, _suspects(before))
         if term.likelihood > nominal.likelihood:
@@ -120,7 +123,7 @@ def _random_force(
 
 def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[MissingTerm | None, bool]:
     """Return a term of free form that explains the record as well as several causes together, and whether better."""
-    if len(selection.included) < 2:
+    if len(selection.included) < 2 or not before:
         return None, False
     white = selection.white
     term = missing_term(selection.bench, selection.nominal, white, selection.seen, _suspects(before))

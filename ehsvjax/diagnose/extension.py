@@ -9,7 +9,7 @@ from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.selection import Selection
 from ehsvjax.effects.effect import UNLIMITED
 from ehsvjax.effects.extended import extended
-from ehsvjax.fit import Fit, at_bound
+from ehsvjax.fit import Effort, Fit, History, at_bound
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import to_values
 from ehsvjax.record import Record
@@ -49,6 +49,8 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
     model = bench.fit.model
     if attached:
         model = extended(model, attached, numbers, len(record) * record.sample_period)
+    if bench.problem.substeps > bench.problem.grid.substeps:
+        model = replace(model, max_step=record.sample_period / int(bench.problem.substeps))
     parameters = {name: float(values[name]) for name in model.free}
     return replace(
         bench.fit,
@@ -57,7 +59,23 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
         parameters=parameters,
         initial=(initial,),
         noise_variance=_variances(selection, refits),
-        effort=bench.fit.effort._replace(refined=True, converged=bool(refits.converged[0])),
+        # Nothing was searched: it was refined from the fit that was diagnosed, by squares, spikes left out.
+        history=History(*(np.zeros(0),) * 4, best={}),
+        effort=Effort(
+            population=0,
+            generations=0,
+            stopped_early=False,
+            simulations=0,
+            refined=True,
+            iterations=0,
+            starts=1,
+            starts_agreeing=1,
+            converged=bool(refits.converged[0]),
+            remaining=float("nan"),
+            step_size=record.sample_period / int(bench.problem.substeps),
+            left_out=int(np.isfinite(list(record.outputs.values())).sum() - bench.problem.samples.measured.sum()),
+        ),
+        huber=None,
         warnings=_at_bounds(model, parameters),
     )
 

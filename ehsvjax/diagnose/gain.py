@@ -56,8 +56,10 @@ def gain_of(
     if validation is None:
         before, after, measured, on = _held_back(selection)
     else:
-        residuals = [fit.residuals(validation) for fit in (nominal, extended)]
         names = [n for n in selection.bench.problem.observed if n in validation.outputs]
+        # What was not fitted has no noise by which its initial conditions could be weighed.
+        judged = validation.select(outputs=names)
+        residuals = [fit.residuals(judged) for fit in (nominal, extended)]
         before, after = ({n: r[n] for n in names} for r in residuals)
         measured = {n: validation.outputs[n] for n in names}
         on = f"{validation.name}, which was not used"
@@ -93,7 +95,9 @@ def _held_back(selection: Selection):
 
 
 def _gain(before, after, readings, noise_variance, rng) -> OutputGain:
-    kept = np.isfinite(before) & np.isfinite(after)
+    kept = np.isfinite(readings)
+    # A simulation that is not finite is infinitely wrong, not missing.
+    before, after = (np.where(np.isfinite(r), r, np.inf) for r in (before, after))
     if not kept.any():
         # Of several outputs one may not have been measured there.
         nothing = float("nan")

@@ -9,6 +9,7 @@ record, whose responses H are simulated, and an autoregression for the sensor.
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Bool
 
 from ehsvjax.diagnose.parts import parts_at
 from ehsvjax.diagnose.refits import Refits, span
@@ -32,14 +33,16 @@ class ProcessNoise(NamedTuple):
     of_sensor: float
 
 
-def process_noise(bench: Workbench, final: Refits) -> ProcessNoise | None:
-    """Compare a random force with noise of the sensor; None for several outputs, or a model without a force."""
-    samples = bench.problem.samples
+def process_noise(bench: Workbench, final: Refits, used: Bool[np.ndarray, "record time signal"]) -> ProcessNoise | None:
+    """Compare a random force with noise of the sensor; None for several outputs, or a model without a force.
+
+    By the samples that are `used` for any other explanation too: likelihoods of other samples are no comparison.
+    """
     kinds = {s.name: s.kind for s in bench.fit.model.signals}
     places = [p for p in bench.places if kinds[p] == "force"]
     if not places or len(bench.problem.observed) > 1:
         return None
-    measured = samples.measured[..., 0]
+    measured = used[..., 0]
     known = span(final.slopes[0][..., 0][:, measured])
     residual = final.residual[0][..., 0]
     r = residual[measured]

@@ -8,11 +8,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Key
 
 from ehsvjax.diagnose.diagnosis import Diagnosis
-from ehsvjax.diagnose.examination import examine, remaining_term
+from ehsvjax.diagnose.examination import Examination, examine, remaining_term
 from ehsvjax.diagnose.extension import as_fit
 from ehsvjax.diagnose.gain import gain_of
 from ehsvjax.diagnose.misfit import misfit_of
 from ehsvjax.diagnose.noise import spikes
+from ehsvjax.diagnose.own_effects import check_own_effects
+from ehsvjax.diagnose.progress import Progress
+from ehsvjax.diagnose.progress import bar as progress_bar
 from ehsvjax.diagnose.selection import select
 from ehsvjax.diagnose.suspects import excluded_by, table_of, unseen_by
 from ehsvjax.diagnose.verdict import verdict_of
@@ -20,7 +23,6 @@ from ehsvjax.diagnose.workbench import Workbench, workbench
 from ehsvjax.draws import check_key
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
-from ehsvjax.effects.extended import effects_of
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
 from ehsvjax.simulate import input_array
@@ -36,7 +38,7 @@ def diagnose(
     *,
     key: Key[Array, ""],
     bank: Sequence[Effect] = BANK,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Diagnosis:
     """Say what a fitted model gets wrong on a record, name the cause, extend the model and measure the gain.
 
@@ -50,7 +52,7 @@ def diagnose(
             for it.
         key: random key, `jax.random.key(0)`, for the intervals of the gain.
         bank: the candidate effects.
-        progress: print each stage.
+        progress: show a bar with the stage and the time that is left; by default in a terminal or a notebook.
 
     Raises:
         ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short, an
@@ -59,52 +61,56 @@ def diagnose(
     """
     bank = _check_bank(bank)
     _check(fit, record, validation, key)
-    say = _announce if progress else _silent
-    say("simulating the model")
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+    with progress_bar(progress) as say:
+        return _diagnosed(fit, record, validation, bank, rng, say)
+
+
+def _diagnosed(
+    fit: Fit, record: Record, validation: Record | None, bank: tuple[Effect, ...], rng, say: Progress
+) -> Diagnosis:
+    say("simulating the model", 0.0)
     bench = workbench(fit, record, bank)
-    _check_used(bench, bank)
+    check_own_effects(bench, bank)
     bench, outliers = _without_spikes(bench)
     selection = select(bench, say)
-    say("testing what is left")
+    say("testing what is left", 0.8)
     examined = examine(selection)
+    nominal = as_fit(examined.selection, selection.nominal, (), record)
+    wider, gain, verdict = _judged(examined, nominal, validation, rng)
+    if verdict[0] == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
+        # What was added on the way to no explanation does not predict: it is left out again, and all is judged anew.
+        examined = examine(selection.without_causes())
+        wider, gain, verdict = _judged(examined, nominal, validation, rng)
+    say("measuring the gain", 0.95)
     selection = examined.selection
-    misfit = misfit_of(examined, outliers)
-    verdict, causes, alternatives = verdict_of(examined, misfit)
-    missing = remaining_term(examined)
-    say("measuring the gain")
-    nominal = as_fit(selection, selection.nominal, (), record)
-    wider = as_fit(selection, selection.final, selection.included, record)
-    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
-    gain = gain_of(selection, nominal, wider, validation, rng)
-    if verdict == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
-        # What was added on the way to no explanation does not predict: it is left out again.
-        selection, wider = selection.without_causes(), nominal
-        gain = gain_of(selection, nominal, wider, validation, rng)
+    word, causes, alternatives = verdict
     suspected = tuple(dict.fromkeys([*causes, *(name for group in alternatives for name in group.causes)]))
     return Diagnosis(
-        verdict=verdict,
+        verdict=word,
         causes=causes,
         alternatives=alternatives,
         table=table_of(selection),
         extended=wider,
         gain=gain,
-        misfit=misfit,
-        excluded=() if verdict == "unexplained" else excluded_by(selection, suspected),
+        misfit=misfit_of(examined, outliers),
+        excluded=() if word == "unexplained" else excluded_by(selection, suspected),
         unseen=unseen_by(selection, suspected),
         innocent=examined.innocent,
-        missing=missing,
+        missing=remaining_term(examined),
         process_noise=examined.chance,
+        integration=selection.integration,
         fit=fit,
         record=record,
     )
 
 
-def _announce(stage: str) -> None:
-    print(f"diagnose: {stage}", flush=True)
-
-
-def _silent(stage: str) -> None:
-    del stage
+def _judged(examined: Examination, nominal: Fit, validation: Record | None, rng: np.random.Generator):
+    """Return the extended model's fit, its gain, and the verdict."""
+    selection, wider = examined.selection, nominal
+    if selection.included:
+        wider = as_fit(selection, selection.final, selection.included, nominal.records[0])
+    return wider, gain_of(selection, nominal, wider, validation, rng), verdict_of(examined)
 
 
 def _check(fit, record, validation, key) -> None:
@@ -150,20 +156,6 @@ def _check_bank(bank) -> tuple[Effect, ...]:
             f"expected every effect of the bank once, got {', '.join(twice)} twice: give yours other names"
         )
     return bank
-
-
-def _check_used(bench: Workbench, bank: tuple[Effect, ...]) -> None:
-    """Refuse a user's effect that no signal of the model takes: nothing would have been tried."""
-    tried = {c.effect for c in bench.candidates}
-    there = set(effects_of(bench.fit.model))
-    for effect in bank:
-        if effect not in tried and effect not in BANK and not any(n.partition("@")[0] == effect.name for n in there):
-            signals = ", ".join(f"{s.name} ({s.kind})" for s in bench.fit.model.signals)
-            needs = f" that comes with {', '.join(effect.needs)}" if effect.needs else ""
-            raise ValueError(
-                f"expected a signal of kind {effect.kind}{needs} for {effect.name}; {bench.fit.model.name} has "
-                f"{signals}"
-            )
 
 
 def _without_spikes(bench: Workbench) -> tuple[Workbench, Bool[np.ndarray, "record time signal"]]:

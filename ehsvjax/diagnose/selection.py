@@ -1,14 +1,16 @@
 """The search for causes: add the one that explains most, refit, look again; then its rivals, swaps and deletions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.arithmetic import finest
 from ehsvjax.diagnose.dependence import strongest_dependence
 from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
+from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
@@ -50,6 +52,22 @@ class Stage(NamedTuple):
     screening: Screening
 
 
+class Integration(NamedTuple):
+    """How a diagnosis was simulated.
+
+    Attributes:
+        step_size: s.
+        left_out: output -> readings that no such step knows, such as those beside a jump: they carry no weight.
+        worth: noise variances by which halving the step changes the difference of any two explanations' sums of
+            squares, at most.
+
+    """
+
+    step_size: float
+    left_out: dict[str, int]
+    worth: float
+
+
 @dataclass(frozen=True, eq=False)
 class Selection:
     """What the search came to.
@@ -64,6 +82,7 @@ class Selection:
         stages: the looks, the first at the nominal model.
         rivals: for each included effect all that were refitted in its place, the best, itself, first.
         gains: for each included effect how much worse the fit is without it, in noise variances.
+        integration: how all was simulated.
 
     """
 
@@ -76,13 +95,14 @@ class Selection:
     stages: tuple[Stage, ...]
     rivals: tuple[tuple[Rival, ...], ...]
     gains: tuple[float, ...]
+    integration: Integration
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
         return replace(self, included=(), final=self.nominal, rivals=(), gains=())
 
 
-def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
+def select(bench: Workbench, progress: Progress) -> Selection:
     """Search for the causes of what a fit leaves of a record.
 
     Args:
@@ -90,7 +110,8 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
         progress: told of each stage.
 
     """
-    progress("simulating every candidate")
+    begun, bench = bench, settled(bench, bench.nominal[None], bench.problem.noise_variance)
+    progress("simulating every candidate", 0.15)
     trials = trials_of(bench, progress)
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
     stages = [_look(trials, (), refit_sets(trials, [[bench.nominal]], [()], plain))]
@@ -100,23 +121,58 @@ def select(bench: Workbench, progress: Callable[[str], None]) -> Selection:
             break
         stages.append(found)
     last = stages[-1]
-    progress("refitting the rivals")
-    for _ in range(_ROUNDS):
+    progress("refitting the rivals", 0.5)
+    for rounds_left in reversed(range(_ROUNDS)):
         trials, white = last.trials, last.white
         included, final, rivals = rivals_of_all(trials, last.included, last.current, white)
         nominal = refit_sets(trials, [[stages[0].current.points[0]]], [()], white)
         gains, needless = _gains(trials, included, final, nominal, last)
-        known = settled(trials.bench, _compared(final, nominal, rivals), white.variances)
+        known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), white)
+        same = needless is None and set(included) == set(last.included)
+        if rounds_left == 0 or (same and known is trials.bench):
+            break
         if needless is not None:
             # What was added first can become needless by what was added later.
             included = tuple(j for j in included if j != needless)
             start = without(trials.bench, final.points[0], needless)
             final = refit_sets(trials, [[start]], [included], white)
-        elif known is trials.bench and set(included) == set(last.included):
-            break
         last = _look(trials._replace(bench=known), included, final)
     return Selection(
-        trials.bench, trials.seen, included, final, nominal, white, (*stages[:-1], last), rivals, tuple(gains)
+        bench=trials.bench,
+        seen=trials.seen,
+        included=included,
+        final=final,
+        nominal=nominal,
+        white=white,
+        stages=(*stages[:-1], last),
+        rivals=rivals,
+        gains=tuple(gains),
+        integration=_integration(begun, trials.bench, worth),
+    )
+
+
+def _settled_for_all(bench: Workbench, points, white: Whitening) -> tuple[Workbench, float]:
+    """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them."""
+    known = settled(bench, points, white.variances)
+    here = int(known.problem.substeps)
+    costs = [
+        np.sum(white(known.problem.samples.outputs - known.simulated(points, substeps=substeps)) ** 2, axis=-1)
+        for substeps in (here, 2 * here)
+    ]
+    worth = float(np.ptp(costs[1] - costs[0]))
+    if known is bench and worth > 1.0 and not finest(known.problem):
+        return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
+    return known, worth
+
+
+def _integration(begun: Workbench, ended: Workbench, worth: float) -> Integration:
+    """Return how all was simulated, from the benches at the start and at the end."""
+    samples = ended.problem.samples
+    left_out = (begun.problem.samples.measured & ~samples.measured).sum(axis=(0, 1))
+    return Integration(
+        step_size=float(samples.sample_period[0]) / int(ended.problem.substeps),
+        left_out=dict(zip(ended.problem.observed, left_out.tolist(), strict=True)),
+        worth=worth,
     )
 
 
@@ -173,7 +229,8 @@ def _next_effect(stage: Stage) -> Stage | None:
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
         some = hopeful[first : first + REFITTED_TOGETHER]
         names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
-        trials.progress(f"refitting the model with {names}{', ...' if len(some) > 3 else ''}")
+        more = ", ..." if len(some) > 3 else ""
+        trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)
         penalised = refitted.cost + [PER_NUMBER * bench.numbers_of(s.candidate) for s in some]
         chosen = int(np.argmin(np.where(np.isnan(penalised), np.inf, penalised)))

@@ -1,7 +1,7 @@
 """Refits of sets of effects: from several starts, and from where a set has been refitted before."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from ehsvjax.diagnose.curves import curve_responses, curves_of_tests, quantities
 from ehsvjax.diagnose.frequencies import parts_of
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts
+from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit, span
 from ehsvjax.diagnose.screening import Screened
 from ehsvjax.diagnose.workbench import Workbench
@@ -45,10 +46,10 @@ class Trials(NamedTuple):
     curves: Float[np.ndarray, "response record time signal"]
     parts: dict[str, Parts]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
-    progress: Callable[[str], None]
+    progress: Progress
 
 
-def trials_of(bench: Workbench, progress: Callable[[str], None]) -> Trials:
+def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and parts of harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
     curves = curve_responses(bench, bench.nominal, curves_of_tests(bench, seen))

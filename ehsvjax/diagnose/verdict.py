@@ -4,7 +4,7 @@ import numpy as np
 
 from ehsvjax.diagnose.diagnosis import Alternative
 from ehsvjax.diagnose.examination import Examination
-from ehsvjax.diagnose.misfit import Misfit
+from ehsvjax.diagnose.noise import lattice
 from ehsvjax.diagnose.rivals import Rival, inseparable
 from ehsvjax.diagnose.selection import Selection
 from ehsvjax.diagnose.workbench import Workbench
@@ -17,7 +17,7 @@ _EXPLAINED = 0.9
 _COARSEST = 2.2
 
 
-def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, ...], tuple[Alternative, ...]]:
+def verdict_of(examined: Examination) -> tuple[str, tuple[str, ...], tuple[Alternative, ...]]:
     """Return the verdict, the causes and the alternatives."""
     selection = examined.selection
     groups = [
@@ -29,7 +29,8 @@ def verdict_of(examined: Examination, misfit: Misfit) -> tuple[str, tuple[str, .
     explained = removed / max(removed + left, 1e-300)
     if examined.lacking or (not examined.innocent and (not groups or explained < _EXPLAINED)):
         return "unexplained", (), ()
-    causes = tuple(group[0] for group in groups) + _quantised(misfit) + ((PROCESS_NOISE,) if examined.chance else ())
+    causes = tuple(group[0] for group in groups) + _quantised(selection)
+    causes += (PROCESS_NOISE,) if examined.chance else ()
     if not causes:
         return "adequate", (), ()
     if examined.or_chance:
@@ -42,12 +43,14 @@ def _names(selection: Selection, group: tuple[Rival, ...]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(selection.bench.candidates[r.candidate].name for r in group))
 
 
-def _quantised(misfit: Misfit) -> tuple[str, ...]:
-    coarse = [
-        name for name, m in misfit.outputs.items()
-        if m.lattice is not None and m.lattice**2 > _COARSEST**2 * (m.noise_floor**2 - m.lattice**2 / 12.0)
-    ]  # fmt: skip
-    return tuple(QUANTISATION if len(misfit.outputs) == 1 else f"{QUANTISATION}@{name}" for name in coarse)
+def _quantised(selection: Selection) -> tuple[str, ...]:
+    samples, observed = selection.bench.problem.samples, selection.bench.problem.observed
+    coarse = []
+    for i, name in enumerate(observed):
+        step = lattice(samples.outputs[0, :, i][samples.measured[0, :, i]])
+        if step is not None and step**2 > _COARSEST**2 * (selection.white.noises[i].variance - step**2 / 12.0):
+            coarse.append(name)
+    return tuple(QUANTISATION if len(observed) == 1 else f"{QUANTISATION}@{name}" for name in coarse)
 
 
 def _settled_by(bench: Workbench, group: tuple[str, ...]) -> str:

@@ -17,8 +17,20 @@ def sentences(diagnosis: "Diagnosis") -> list[str]:
     """Return the diagnosis as lines of text, what matters first."""
     lines = [f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {verdict(diagnosis)}", ""]
     lines += [f"  {line}" for line in (*misfit_lines(diagnosis), *cause_lines(diagnosis), *gain_lines(diagnosis))]
-    lines += [f"  {line}" for line in next_lines(diagnosis)]
+    lines += [f"  {line}" for line in (*next_lines(diagnosis), integration_line(diagnosis))]
     return lines
+
+
+def integration_line(diagnosis: "Diagnosis") -> str:
+    """Return at which step all was simulated, and what that is worth."""
+    step, left_out, worth = diagnosis.integration
+    readings = " and ".join(f"{count} readings of {name}" for name, count in left_out.items() if count)
+    beside = f"; {readings}, which no such step knows, carry no weight" if readings else ""
+    much = "" if worth < 1.0 else ": more than it should; simulate the model with a method for stiff equations"
+    return (
+        f"simulated in steps of {1e3 * step:.3g} ms: at half of it no comparison changes by more than "
+        f"{max(worth, 0.01):.2g} noise variances{much}{beside}"
+    )
 
 
 def verdict(diagnosis: "Diagnosis") -> str:
@@ -59,8 +71,8 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
             lines.append(
                 f"  the readings lie on a lattice of {m.lattice:.3g}{unit}: {100 * min(share, 1.0):.0f}% of the noise"
             )
-    first = diagnosis.misfit.tests[0]
-    if diagnosis.verdict != "adequate":
+    if diagnosis.verdict != "adequate" and diagnosis.misfit.tests:
+        first = diagnosis.misfit.tests[0]
         repeating = _repeating(first.period, quantity_unit(diagnosis.fit.model, first.quantity))
         lines.append(
             f"the residual depends on {first.quantity}{repeating} (seen from {first.place}): p "
@@ -112,7 +124,7 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
     lines = []
     for name, g in diagnosis.gain.outputs.items():
         unit = _spaced(diagnosis.fit.model.unit(name))
-        if diagnosis.extended.model is diagnosis.fit.model:
+        if diagnosis.extended.model.name == diagnosis.fit.model.name:
             lines.append(
                 f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g}{unit}, noise {g.noise_floor:.4g}{unit}"
             )  # fmt: skip

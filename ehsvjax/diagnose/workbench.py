@@ -169,9 +169,7 @@ def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
 
     """
     # How much a force moves depends on the machine: on a larger one a probe of any fixed size is lost in rounding.
-    bench = _bench(fit, record, bank, {})
-    bench = _bench(fit, record, bank, _calibrated(bench))
-    return settled(bench, bench.nominal[None], bench.problem.noise_variance)
+    return _bench(fit, record, bank, _calibrated(_bench(fit, record, bank, {})))
 
 
 def _calibrated(bench: Workbench) -> dict[str, float]:

@@ -85,8 +85,8 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     given_wrong = tuple(c for c in attached if c.effect.kind == "constant")
     drifting = tuple(c for c in attached if c.effect.kind == "parameter")
     remembering = tuple(c for c in attached if c.effect.memory and c.effect.kind != "input")
-    sensing = {c.name for c in remembering if c.signal in base.outputs}
-    inside = {c.name for c in remembering} - sensing
+    sensing = {_slot(c) for c in remembering if c.signal in base.outputs}
+    inside = {_slot(c) for c in remembering} - sensing
     names = (*base.inputs, *(disturbance(place) for place in places))
     at_signal: dict[str, list[Candidate]] = {}
     for candidate in attached:
@@ -112,8 +112,8 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
                 if not candidate.effect.memory:
                     value = candidate.effect.apply(own, value, context)
                     continue
-                value, memory = candidate.effect.apply(own, value, context, moment.memories[candidate.name])
-                moment.remember(candidate.name, memory)
+                value, memory = candidate.effect.apply(own, value, context, moment.memories[_slot(candidate)])
+                moment.remember(_slot(candidate), memory)
             return value
 
         return disturbed
@@ -136,7 +136,7 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     def start(parameters, initial, series):
         parameters = corrected(parameters)
         state = base.start(parameters, initial, series)
-        memories = {c.name: tuple(jnp.asarray(m) for m in c.effect.memory) for c in remembering}
+        memories = {_slot(c): tuple(jnp.asarray(m) for m in c.effect.memory) for c in remembering}
         moment = _Moment(0.0, 0.0, memories, sensing, values=series)
         if sensing:
             base.measure(parameters, state, series, disturbing(parameters, identity, [moment]))
@@ -185,6 +185,11 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     return base._replace(
         start=start, stepper=stepper, measure=measure, prepare=prepare if inputs else base.prepare, inputs=names
     )
+
+
+def _slot(candidate: Candidate) -> str:
+    """Where the memory of an effect is kept: two forms of one effect share their name, but no number."""
+    return candidate.parameter(candidate.effect.parameters[0].name)
 
 
 class _Moment:
