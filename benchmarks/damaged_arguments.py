@@ -2,16 +2,15 @@
 
 import tempfile
 from collections.abc import Iterator
-from pathlib import Path
 
 import jax
 import numpy as np
 
 import ehsvjax
 from benchmarks.damaged_calls import Call, damaged
-from benchmarks.damaged_models import tank, tank_fit, tank_record
-from ehsvjax import effects, excitation, hydraulics, integrators, operators, paper
+from benchmarks.damaged_models import tank, tank_record
 from ehsvjax import __main__ as demo
+from ehsvjax import effects, excitation, hydraulics, integrators, operators, paper
 
 NAN, INF = float("nan"), float("inf")
 NOT_ANYTHING = {"None": None, "object": object(), "function": print}
@@ -38,7 +37,11 @@ NAME = NOT_ANYTHING | {
     "True": True,
 }
 CHOICE = NOT_ANYTHING | TEXTS | {"number": 3.0, "list": ["x"], "array": np.ones(2), "capital": "ESTIMATE "}
-KEY = NOT_ANYTHING | TEXTS | {"number": 3, "list": [0, 1], "NaN": NAN, "array": np.ones(2), "keys": jax.random.key(0)[None]}
+KEY = (
+    NOT_ANYTHING
+    | TEXTS
+    | {"number": 3, "list": [0, 1], "NaN": NAN, "array": np.ones(2), "keys": jax.random.key(0)[None]}
+)
 FUNCTION = {"None": None, "object": object(), "text": "sin", "number": 3.0, "list": [], "mapping": {}}
 THING = NOT_ANYTHING | TEXTS | {"number": 3.0, "list": [], "list of numbers": [1.0], "mapping": {"a": 1.0}}
 MAPPING = {"object": object(), "function": print, "text": "gain", "number": 3.0, "list": ["gain"], "set": {"gain"}}
@@ -82,8 +85,11 @@ def bounds_of(name: str) -> dict:
 
 
 def calls() -> Iterator[Call]:
-    """Yield a right call of every public function, and one for each wrong value of each argument."""
-    for room in (of_excitation, of_operators, of_models, of_hydraulics, of_effects, of_simulation, of_records, of_fits):
+    """Yield a right call of every function that makes signals, operators, models and effects, or simulates them.
+
+    Behind each comes one for each wrong value of each argument.
+    """
+    for room in (of_excitation, of_operators, of_models, of_hydraulics, of_effects, of_simulation):
         yield from room()
 
 
@@ -91,16 +97,22 @@ def of_excitation() -> Iterator[Call]:
     """Yield calls of the test signals."""
     key, unit = jax.random.key(0), {"amplitude": (1.0, POSITIVE)}
     timing = {"duration": (1.0, TIME), "sample_period": (0.01, POSITIVE | {"huge": 1e300, "tiny": 1e-300})}
-    holds = without(TIME, "list") | {"three": [1.0, 2.0, 3.0], "swapped": (0.2, 0.1), "texts": ["a", "b"], "short": 1e-9}
+    holds = without(TIME, "list") | {
+        "three": [1.0, 2.0, 3.0],
+        "swapped": (0.2, 0.1),
+        "texts": ["a", "b"],
+        "short": 1e-9,
+    }
     drawn = {"key": (key, KEY), **unit, "hold_time": (0.1, without(holds, "huge")), **timing, "offset": (0.0, NUMBER)}
     lines = NOT_ANYTHING | TEXTS | NOT_FINITE | {
-        "empty": [], "texts": ["a"], "twice": [1.0, 1.0], "too high": [60.0], "square": np.ones((2, 2)), "negative": [-1.0],
-        "mapping": {1.0: 2.0}, "complex": [1j], "True": True,
+        "empty": [], "texts": ["a"], "twice": [1.0, 1.0], "too high": [60.0], "square": np.ones((2, 2)),
+        "negative": [-1.0], "mapping": {1.0: 2.0}, "complex": [1j], "True": True,
     }  # fmt: skip
     yield from damaged("pseudo_random_signal", excitation.pseudo_random_signal, drawn)
     yield from damaged("pseudo_random_binary_signal", excitation.pseudo_random_binary_signal, drawn)
     yield from damaged("multisine", excitation.multisine,
-        {"key": (key, KEY), **unit, "frequencies_hz": ([1.0, 2.0], lines), **timing, "phases": ("random", CHOICE)})  # fmt: skip
+        {"key": (key, KEY), **unit, "frequencies_hz": ([1.0, 2.0], lines), **timing,
+         "phases": ("random", CHOICE)})  # fmt: skip
     yield from damaged("staircase", excitation.staircase,
         {**unit, "levels": (5, WHOLE | {"one": 1}), "hold_time": (0.1, TIME),
          "sample_period": (0.01, POSITIVE | {"huge": 1e300, "tiny": 1e-300})})  # fmt: skip
@@ -227,7 +239,8 @@ def of_effects() -> Iterator[Call]:
     own = effects.amplitude("force", "{value}", lambda scales: 1.0)
     texts = without(NAME, "empty", "blank", "blanks around it")
     yield from damaged("Effect", ehsvjax.Effect, {
-        "name": ("sticking", NAME | {"with @": "a@b"}), "kind": ("force", NAME | {"forse": "forse", "senzor": "senzor"}),
+        "name": ("sticking", NAME | {"with @": "a@b"}),
+        "kind": ("force", NAME | {"forse": "forse", "senzor": "senzor"}),
         "parameters": ((own,), {"None": None, "object": object(), "text": "a", "number": 3.0, "none": (), "one": own,
                                 "numbers": (1.0,), "twice": (own, own)}),
         "apply": (lambda own, value, context: value, FUNCTION),
@@ -241,7 +254,9 @@ def of_effects() -> Iterator[Call]:
     tries = NOT_ANYTHING | {"text": "12", "number": 3.0, "empty": [], "texts": ["a"], "NaN": [NAN], "negative": [-1.0]}
 
     def made(make):
-        return lambda **arguments: ehsvjax.Effect("sticking", "force", (make(**arguments), own._replace(name="other")), abs)
+        return lambda **arguments: ehsvjax.Effect(
+            "sticking", "force", (make(**arguments), own._replace(name="other")), abs
+        )
 
     yield from damaged("effects.amplitude", made(effects.amplitude), number | probe | bound)
     yield from damaged("effects.size", made(effects.size), number | probe | {"upper": bound["upper"]})
@@ -253,7 +268,8 @@ def of_effects() -> Iterator[Call]:
     contexts = {"load_force": ("position", "velocity")}
     yield from damaged("effects.candidates", effects.candidates, {
         "model": (valve, THING), "bank": (effects.BANK, without(THING, "list")),
-        "contexts": (contexts, MAPPING | {"None": None}), "observed": (("position",), without(THING, "list")),
+        "contexts": (contexts, MAPPING | {"None": None}),
+        "observed": (("position",), without(THING, "list", "mapping")),
     })  # fmt: skip
     yield from damaged("effects.effects_of", effects.effects_of, {"model": (valve, THING)})
 
@@ -266,12 +282,16 @@ def of_simulation() -> Iterator[Call]:
         "model": (model, THING), "record": (record, THING), **values, "initial": ({"start": 0.0}, values_of("start")),
         "substeps": (2, without(WHOLE, "None")), "signal": (lambda name, value, **context: value, FUNCTION),
     })  # fmt: skip
-    variances = without(values_of("level"), "None") | {"None": None, "zero": {"level": 0.0}, "negative": {"level": -1.0}}
-    known = {"initial": ("estimate", without(CHOICE, "list") | {"unknown": {"nobody": 1.0}, "NaN in it": {"start": NAN}})}
+    variances = without(values_of("level"), "None") | {
+        "None": None,
+        "zero": {"level": 0.0},
+        "negative": {"level": -1.0},
+    }
     for function in (ehsvjax.design, ehsvjax.cramer_rao_bound):
         yield from damaged(function.__name__, function, {
-            "model": (model, THING), "records": (record, THING), "noise_variance": ({"level": 1e-4}, variances | {"empty": {}}),
-            **values, "initial_values": ({"start": 0.0}, values_of("start")), **known,
+            "model": (model, THING), "records": (record, THING),
+            "noise_variance": ({"level": 1e-4}, variances | {"empty": {}}),
+            **values, "initial_values": ({"start": 0.0}, values_of("start")),
         })  # fmt: skip
     yield from damaged("paper.van_der_pol_record", paper.van_der_pol_record,
         {"key": (jax.random.key(0), KEY), "noise_variance": (0.05, NOT_NEGATIVE)})  # fmt: skip
@@ -289,96 +309,3 @@ def of_simulation() -> Iterator[Call]:
         "no value": ["--out"],
     }.items():
         yield Call("python -m ehsvjax", "", label, lambda a=arguments: demo.main(a))
-
-
-def of_records() -> Iterator[Call]:
-    """Yield calls that make and change records."""
-    record = tank_record()
-    series = NOT_ANYTHING | {
-        "text": "u", "number": 3.0, "list": [], "short": {"command": [1.0, 2.0]}, "texts": {"command": ["a"] * len(record)},
-        "NaN": {"command": np.full(len(record), NAN)}, "complex": {"command": np.full(len(record), 1j)},
-        "number as name": {3: record.inputs["command"]}, "no name": {"": record.inputs["command"]}, "None in it": {"command": None},
-    }  # fmt: skip
-    times = NOT_ANYTHING | {
-        "text": "t", "number": 3.0, "empty": [], "one": [0.0], "backwards": record.time[::-1], "NaN": record.time * NAN,
-        "constant": record.time * 0.0, "two axes": np.ones((4, 2)), "complex": record.time * 1j,
-    }  # fmt: skip
-    yield from damaged("Record", ehsvjax.Record, {
-        "time": (record.time, times), "inputs": (dict(record.inputs), series), "outputs": (dict(record.outputs), series),
-        "hold": ("zero", CHOICE), "name": ("a", without(NAME, "empty", "blank", "blanks around it", "line break")),
-        "uniform": (True, FLAG),
-    })  # fmt: skip
-    yield from damaged("Record.slice", record.slice,
-        {"start": (0.0, without(NUMBER, "-inf", "True")), "stop": (2.0, without(NUMBER, "inf", "True"))})  # fmt: skip
-    yield from damaged("Record.split", record.split, {"at": (1.0, NUMBER)})
-    yield from damaged("Record.split by fraction", lambda fraction: record.split(fraction=fraction),
-        {"fraction": (0.5, SHARE | {"zero": 0.0})})  # fmt: skip
-    yield from damaged("Record.resample", record.resample, {"sample_period": (0.02, TIME | {"tiny": 1e-300})})
-    yield from damaged("Record.select", record.select, {"outputs": (["level"], THING)})
-    frame = record.to_dataframe()
-    columns = {"None": None, "text": "u", "number": 3.0, "list": ["level"], "unknown": {"a": "b"}, "wrong": {"a": 3.0}}
-    read = {"time": ("time", {"None": None, "unknown": "t", "list": [], **NOT_FINITE, "negative": -1.0, "zero": 0.0}),
-            "inputs": ({"command": "command"}, columns), "outputs": ({"level": "level"}, columns)}  # fmt: skip
-    yield from damaged("Record.from_dataframe", ehsvjax.Record.from_dataframe, {"frame": (frame, THING), **read})
-    table = Path(tempfile.mkdtemp()) / "tank.csv"
-    frame.to_csv(table, index=False)
-    yield from damaged("Record.from_csv", ehsvjax.Record.from_csv, {"path": (table, PATH | {"None": None}), **read})
-
-    def with_column(**fields):
-        return ehsvjax.Record.from_dataframe(
-            frame, time="time", inputs={"command": "command"}, outputs={"level": ehsvjax.Column(**fields)}
-        )
-
-    yield from damaged("Column", with_column, {
-        "name": ("level", NAME), "scale": (1.0, NUMBER | {"zero": 0.0}), "offset": (0.0, NUMBER),
-    })  # fmt: skip
-
-
-def of_fits() -> Iterator[Call]:
-    """Yield calls that identify, ask a fit, and diagnose."""
-    model, record, fit = tank(), tank_record(), tank_fit()
-    initial = without(CHOICE, "list") | {"unknown": {"nobody": 1.0}, "NaN in it": {"start": NAN}, "text in it": {"start": "0"}}
-    variances = values_of("level") | {"zero": {"level": 0.0}, "negative": {"level": -1.0}}
-    yield from damaged("identify", ehsvjax.identify, {
-        "model": (model, THING), "records": (record, THING), "key": (jax.random.key(0), KEY),
-        "population": (4, WHOLE), "generations": (1, WHOLE), "bounds": ({"gain": (1.0, 3.0)}, bounds_of("gain")),
-        "fixed": ({"lag": 1.0}, values_of("lag")), "initial": ("estimate", initial), "refine": (False, FLAG),
-        "noise_variance": ({"level": 1e-4}, variances), "huber": (1.5, without(POSITIVE, "None")),
-        "operators": (ehsvjax.Operators(), THING), "tolerance": (0.01, NOT_NEGATIVE), "starts": (1, WHOLE),
-        "islands": (1, WHOLE), "devices": (None, without(THING, "None")), "progress": (False, FLAG),
-        "checkpoint": (None, PATH),
-    })  # fmt: skip
-
-    def with_operators(**fields):
-        operators = ehsvjax.Operators(**fields)
-        return ehsvjax.identify(model, record, key=jax.random.key(0), population=4, generations=1, refine=False,
-                                operators=operators)  # fmt: skip
-
-    own = ehsvjax.Operators()
-    yield from damaged("Operators", with_operators, {
-        "selection": (own.selection, FUNCTION), "crossover": (own.crossover, FUNCTION), "mutation": (own.mutation, FUNCTION),
-        "elites": (1, WHOLE), "immigrants": (0.02, SHARE),
-    })  # fmt: skip
-    new = {"initial": ("nominal", initial)}
-    for method in ("simulate", "residuals", "score", "initial_of"):
-        optional = without(THING, "None") if method == "residuals" else THING
-        yield from damaged(f"Fit.{method}", getattr(fit, method), {"record": (record, optional), **new})
-    noise, level = {"noise": ("white", CHOICE)}, {"level": (0.95, SHARE | {"zero": 0.0, "one": 1.0})}
-    yield from damaged("Fit.precision", fit.precision, noise)
-    names = {"text": "gain", "number": 3.0, "numbers": [1.0], "unknown": ["nobody"], "empty": [], "object": object()}
-    yield from damaged("Fit.profile_likelihood", fit.profile_likelihood, {"names": (["gain"], names), **level, **noise})
-    yield from damaged("Fit.bootstrap", fit.bootstrap, {
-        "key": (jax.random.key(0), KEY), "draws": (2, WHOLE), "kind": ("parametric", CHOICE), **noise,
-    })  # fmt: skip
-    yield from damaged("Fit.bands", fit.bands, {"record": (record, without(THING, "None")), **new, **level, **noise})
-    yield from damaged("Fit.plot", fit.plot, {"record": (record, without(THING, "None"))})
-    folder = Path(tempfile.mkdtemp())
-    fit.save(folder / "fit.npz")
-    yield from damaged("Fit.save", fit.save, {"path": (folder / "again.npz", PATH | {"None": None})})
-    yield from damaged("Fit.load", ehsvjax.Fit.load,
-        {"path": (folder / "fit.npz", PATH | {"None": None}), "model": (model, THING)})  # fmt: skip
-    for wrong, argument in ((THING, "fit"), (THING, "record"), (without(THING, "None"), "validation"), (KEY, "key"),
-                            (THING, "bank"), (FLAG, "progress")):  # fmt: skip
-        right = {"fit": fit, "record": record, "validation": None, "key": jax.random.key(0), "bank": effects.BANK}
-        for label, value in wrong.items():
-            yield Call("diagnose", argument, label, lambda a=argument, v=value, r=right: ehsvjax.diagnose(**{**r, a: v}))

@@ -17,7 +17,6 @@ Calls run in a process of their own with limited memory, which is started again 
 
 import argparse
 import contextlib
-import dataclasses
 import io
 import json
 import linecache
@@ -59,7 +58,7 @@ class Call(NamedTuple):
 
 
 def damaged(name: str, function: Callable, arguments: dict[str, tuple[Any, dict[str, Any]]]) -> Iterator[Call]:
-    """Yield the right call, and one for each wrong value of each argument: name -> (right value, wrong ones by label)."""
+    """Yield the right call, and one for each wrong value of each argument: name -> (right value, label -> wrong)."""
     right = {argument: value for argument, (value, _) in arguments.items()}
     yield Call(name, "", "nothing", lambda: function(**right), may_answer=True)
     for argument, (_, wrong) in arguments.items():
@@ -69,9 +68,9 @@ def damaged(name: str, function: Callable, arguments: dict[str, tuple[Any, dict[
 
 def every_call() -> list[Call]:
     """Return all calls; imports what they need."""
-    from benchmarks import damaged_arguments, damaged_models
+    from benchmarks import damaged_arguments, damaged_models, damaged_results
 
-    return [*damaged_arguments.calls(), *damaged_models.calls()]
+    return [*damaged_arguments.calls(), *damaged_results.calls(), *damaged_models.calls()]
 
 
 class Answer(NamedTuple):
@@ -176,7 +175,7 @@ def _forward(stream, lines: "queue.Queue[str]") -> None:
 
 
 def offenders(found: list[Answer]) -> list[Answer]:
-    """Return the answers that should not be: tracebacks, acceptance, a right call refused, and refusals that take long."""
+    """Return the answers that should not be: tracebacks, acceptance, right calls refused, refusals that take long."""
     return [
         a
         for a in found

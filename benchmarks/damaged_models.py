@@ -222,7 +222,9 @@ def calls() -> Iterator[Call]:
         yield Call("simulate own model", "", fault, lambda make=make: _simulated(make()))
         if not fault.startswith(("NaN", "division")):
             yield Call("identify own model", "", fault, lambda make=make: _identified(make()))
-    yield Call("identify own model", "", "every parameter fixed", lambda: _identified(tank(parameters=FIXED), "nominal"))
+    yield Call(
+        "identify own model", "", "every parameter fixed", lambda: _identified(tank(parameters=FIXED), "nominal")
+    )
     for label, name in {"dollar": "x$_1$", "angle": "a<b>", "inner blank": "inner level", "Greek": "ξ"}.items():
         gain, lag = tank().parameters
         renamed = tank(parameters=(gain, lag, Parameter(name, name, "", 1.0, 0.5, 1.5)))

@@ -186,7 +186,7 @@ def same_structure(name: str, found: Any, whose: str, wanted: Any) -> None:
 
     """
     numeric = all(map(is_numeric, jax.tree.leaves(found)))
-    if not numeric or jax.tree.structure(found) != jax.tree.structure(wanted):
+    if not numeric or str(jax.tree.structure(found)) != str(jax.tree.structure(wanted)):
         remedy = "return the same keys in the same structure, with a number for each"
         raise ValueError(f"expected {name} to be like {whose}, {in_words(wanted)}, got {in_words(found)}: {remedy}")
 

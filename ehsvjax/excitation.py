@@ -168,8 +168,10 @@ def _hold_starts(
     key: PRNGKeyArray, hold_time: float | Sequence[float], duration: float, sample_period: float
 ) -> tuple[Float64[np.ndarray, " level"], Signal]:
     times = sample_times(duration, sample_period)
-    several = isinstance(hold_time, Sequence) and not isinstance(hold_time, str)
-    pair = tuple(hold_time) if several else (hold_time, hold_time)
+    if isinstance(hold_time, Sequence) and not isinstance(hold_time, str):
+        pair = tuple(hold_time)
+    else:
+        pair = (hold_time, hold_time)
     if len(pair) != 2:
         raise ValueError(
             f"expected hold_time to be a number or a pair (shortest, longest), got {len(pair)} numbers; "

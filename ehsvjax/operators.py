@@ -328,10 +328,10 @@ def _spin_wheel(key: Key[Array, ""], weights: Float[Array, " individual"], count
 
 def _rows(name: str, values: object) -> tuple[int, int]:
     """Return the shape of rows of parameters."""
-    shape = getattr(values, "shape", ())
+    shape: tuple[int, ...] = getattr(values, "shape", ())
     if len(shape) != 2:
         raise refused(name, "an array [individual, parameter]", values)
-    return shape
+    return shape[0], shape[1]
 
 
 def _check_probability(probability: float | None) -> None:

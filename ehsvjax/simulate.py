@@ -19,7 +19,6 @@ from ehsvjax.models.check import check_equations, where_not_finite
 from ehsvjax.models.model import Equations, Model, identity
 from ehsvjax.record import Record
 
-
 # Of one simulation: what takes minutes.
 _MOST_STEPS = 10**9
 
@@ -68,8 +67,8 @@ def simulate(
     instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
     instance("record", record, Record, "make one with Record or Record.from_csv")
     function("signal", signal, "signal(name, value, **context) -> value")
-    values = _changed(model, "parameters", model.nominal, parameters)
-    start = _changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
+    values = changed(model, "parameters", model.nominal, parameters)
+    start = changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
     grid = grid_of(model, record, substeps)
     inputs = input_array(model, record)
     with jax.enable_x64(True):
@@ -90,9 +89,15 @@ def simulate(
     return found
 
 
-def _changed(
+def changed(
     model: Model, kind: str, nominal: Mapping[str, float], changes: Mapping[str, float] | None
 ) -> dict[str, float]:
+    """Return nominal values with changes; `kind` says what they are, "parameters" or "initial conditions".
+
+    Raises:
+        ValueError: for a name that is none of the nominal ones', or a value that is no finite number.
+
+    """
     changes = by_name(kind, changes, "{'mass': 20.0}")
     for name, value in changes.items():
         model.parameter(name)
@@ -117,8 +122,8 @@ def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
         raise ValueError(f"expected substeps to be a whole number of at least 1, got {substeps!r}")
     if substeps * len(record) > _MOST_STEPS:
         raise ValueError(
-            f"expected at most {_MOST_STEPS:g} integration steps, got {len(record)} samples of {substeps:.3g} each: take "
-            f"fewer substeps, or a longer max_step of {model.name} ({model.max_step} s)"
+            f"expected at most {_MOST_STEPS:g} integration steps, got {len(record)} samples of {substeps:.3g} each: "
+            f"take fewer substeps, or a longer max_step of {model.name} ({model.max_step} s)"
         )
     return Grid(int(substeps), record.hold)
 

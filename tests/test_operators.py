@@ -378,7 +378,9 @@ def test_immigrants_replace_any_individual_equally_often_by_uniform_ones():
 
 @pytest.mark.parametrize("count", [-1, 4])
 def test_wrong_number_of_immigrants_is_refused(count):
-    with pytest.raises(ValueError, match=f"expected count to be a whole number from 0 to 3, got {count}: at most the number of"):
+    with pytest.raises(
+        ValueError, match=f"expected count to be a whole number from 0 to 3, got {count}: at most the number of"
+    ):
         operators.immigrants(jax.random.key(0), jnp.zeros((3, 2)), count)
 
 

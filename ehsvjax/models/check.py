@@ -1,4 +1,4 @@
-"""Whether a model's equations can be simulated: traced once over scalars, no number computed, at a model's first use."""
+"""Whether a model's equations can be simulated: traced once over scalars, without a number computed, at first use."""
 
 import difflib
 import functools
@@ -23,7 +23,9 @@ _NOT_THE_USERS = (_OWN, *(Path(sysconfig.get_paths()[key]) for key in ("stdlib",
 
 _NUMPY = "call the function of jax.numpy in place of NumPy's: jnp.sin, jnp.interp, ...; make arrays by jnp.stack([...])"
 _CONDITION = "write jnp.where(condition, a, b), jnp.maximum, jnp.logical_and, ... in place of if, while, max, and"
-_CONVERSION = "leave out float() and int(), and call jnp.sin, ... in place of math.sin: values are known only when it runs"
+_CONVERSION = (
+    "leave out float() and int(), and call jnp.sin, ... in place of math.sin: values are known only when it runs"
+)
 _NAMES = "use the names of the model's parameters, initial conditions, inputs and state"
 # What an exception is, a part of its words, and what to do.
 _REMEDIES = (
@@ -87,8 +89,8 @@ def _checked(
         remedy = f"write signal({name!r}, value) where the equations use it, or leave it out of the model's signals"
         if kind != "sensor":
             raise ValueError(
-                f"expected a value of {model} to pass through its signal {name!r}, or an effect there would do nothing, "
-                f"got none: {remedy}"
+                f"expected a value of {model} to pass through its signal {name!r}, got none, so that an effect there "
+                f"would do nothing: {remedy}"
             )
         warnings.warn(
             f"the output {name!r} of {model} does not pass through its signal, so that a diagnosis cannot tell whether "

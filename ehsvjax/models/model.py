@@ -138,7 +138,7 @@ class Model:
             raise ValueError(f"expected {self.name} to have an output, got no signal of kind 'sensor'")
         for parameter in (*self.parameters, *self.initial):
             check_bounds(parameter)
-            if parameter.output is not None and parameter.output not in self.outputs:
+            if parameter.output is not None and label("output", parameter.output) not in self.outputs:
                 raise ValueError(
                     f"expected the output that shows {parameter.name} of {self.name} to be a signal of kind 'sensor', "
                     f"{', '.join(self.outputs)}; got {parameter.output!r}"
@@ -266,8 +266,9 @@ def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
         ValueError: if they are no such pair.
 
     """
-    pair = [as_number(bound) for bound in bounds] if isinstance(bounds, tuple | list | np.ndarray) else []
-    if len(pair) != 2 or None in pair:
+    given = map(as_number, bounds) if isinstance(bounds, tuple | list | np.ndarray) else ()
+    pair = [bound for bound in given if bound is not None]
+    if len(pair) != 2 or len(bounds) != 2:
         raise ValueError(f"expected bounds of {name} as (lower, upper), got {bounds!r}: give two numbers, SI")
     return pair[0], pair[1]
 
