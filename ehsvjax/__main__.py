@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+import tempfile
 import textwrap
 import time
 from collections.abc import Callable, Sequence
@@ -27,6 +28,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the results (default: out)")
     parser.add_argument("--seed", type=int, default=0, help="of the noise and of the search (default: 0)")
     options = parser.parse_args(arguments)
+    if not 0 <= options.seed < 2**32:
+        parser.error(f"expected --seed from 0 to {2**32 - 1}, got {options.seed}")
+    try:
+        # Now, and not after minutes of work.
+        options.out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=options.out).close()
+    except OSError as error:
+        parser.error(f"expected --out to be a folder that can be written, got {options.out} ({error.strerror})")
     began = time.perf_counter()
     oscillator_key, valve_key = jax.random.split(jax.random.key(options.seed))
 

@@ -14,6 +14,7 @@ from jax.custom_batching import custom_vmap
 from jaxtyping import Array, Float, Int, Key
 
 from ehsvjax import kernels
+from ehsvjax.checks import refused
 
 # XLA shares larger arrays out to threads, which a native function cannot.
 _MOST_IN_A_KERNEL = 16384
@@ -29,7 +30,7 @@ def check_key(key) -> None:
     typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ()
     raw = isinstance(key, jax.Array) and key.dtype == jnp.uint32 and key.shape == (2,)
     if not (typed or raw):
-        raise ValueError(f"expected key to be a random key such as jax.random.key(0), got {key!r}")
+        raise refused("key", "a random key such as jax.random.key(0)", key, "make one of a whole number, the seed")
 
 
 def split(key: Key[Array, ""], count: int) -> Key[Array, " count"]:

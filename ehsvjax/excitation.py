@@ -7,13 +7,18 @@ are drawn before they are sampled, so a held signal stays the same when only the
 
 import math
 from collections.abc import Sequence
-from numbers import Integral, Real
 
 import jax
 import numpy as np
 from jaxtyping import Float64, Num, PRNGKeyArray
 
+from ehsvjax.checks import choice, number, positive, refused, whole
+from ehsvjax.draws import check_key
+
 Signal = Float64[np.ndarray, " time"]
+
+# Of one signal: 0.8 GB, a day at 1 kHz.
+_MOST_SAMPLES = 10**8
 
 
 def pseudo_random_signal(
@@ -34,11 +39,12 @@ def pseudo_random_signal(
     Raises ValueError unless all numbers are finite, all but the offset positive, and hold times and duration
     at least one sample period.
     """
+    check_key(key)
     level_key, hold_key = jax.random.split(key)
-    _require_positive("amplitude", amplitude)
+    positive("amplitude", amplitude)
     starts, times = _hold_starts(hold_key, hold_time, duration, sample_period)
     levels = amplitude * (2.0 * _uniform(level_key, len(starts)) - 1.0)
-    return _require_finite("offset", offset) + _held(levels, starts, times, sample_period)
+    return number("offset", offset) + _held(levels, starts, times, sample_period)
 
 
 def pseudo_random_binary_signal(
@@ -54,11 +60,12 @@ def pseudo_random_binary_signal(
 
     Arguments, units and errors as for `pseudo_random_signal`.
     """
+    check_key(key)
     level_key, hold_key = jax.random.split(key)
-    _require_positive("amplitude", amplitude)
+    positive("amplitude", amplitude)
     starts, times = _hold_starts(hold_key, hold_time, duration, sample_period)
     levels = np.where(_uniform(level_key, len(starts)) < 0.5, -amplitude, amplitude)
-    return _require_finite("offset", offset) + _held(levels, starts, times, sample_period)
+    return number("offset", offset) + _held(levels, starts, times, sample_period)
 
 
 def multisine(
@@ -79,7 +86,7 @@ def multisine(
     Raises ValueError for numbers that are not positive and finite, no or repeated lines, a line at or above
     half the sampling rate, an unknown choice of phases, and a key that does not go with that choice.
     """
-    _require_positive("amplitude", amplitude)
+    positive("amplitude", amplitude)
     times = sample_times(duration, sample_period)
     frequencies = _lines(frequencies_hz, sample_period)
     total = np.zeros_like(times)
@@ -97,15 +104,15 @@ def staircase(*, amplitude: float, levels: int, hold_time: float, sample_period:
     Raises ValueError for fewer than two levels, numbers that are not positive and finite, and a hold time
     below the sample period.
     """
-    _require_positive("amplitude", amplitude)
-    if not isinstance(levels, Integral) or levels < 2:
-        raise ValueError(f"expected levels to be a whole number above 1, got {levels!r}; give at least 2")
+    positive("amplitude", amplitude)
+    whole("levels", levels, 2, _MOST_SAMPLES)
     _require_hold_time(hold_time, sample_period)
+    times = sample_times((2 * levels - 1) * hold_time, sample_period)
     # Mirrored halves, so that a level met on the way down equals the one met on the way up to the last bit.
     climb = amplitude * np.linspace(-1.0, 1.0, levels)
     values = np.concatenate([climb, climb[-2::-1]])
     starts = hold_time * np.arange(len(values))
-    return _held(values, starts, sample_times(len(values) * hold_time, sample_period), sample_period)
+    return _held(values, starts, times, sample_period)
 
 
 def chirp(
@@ -125,12 +132,11 @@ def chirp(
     Raises ValueError for numbers that are not positive and finite, frequencies at or above half the sampling
     rate, and an unknown method.
     """
-    _require_positive("amplitude", amplitude)
+    positive("amplitude", amplitude)
     times = sample_times(duration, sample_period)
     for name, frequency in (("start_frequency", start_frequency), ("stop_frequency", stop_frequency)):
         _require_resolved(name, frequency, sample_period)
-    if method not in ("linear", "logarithmic"):
-        raise ValueError(f"expected method to be 'linear' or 'logarithmic', got {method!r}; choose one")
+    choice("method", method, ("linear", "logarithmic"))
     from scipy import signal  # half of this package's import time, if it were imported with it
 
     sweep = signal.chirp(times, start_frequency, duration, stop_frequency, method=method, phi=-90.0)
@@ -140,14 +146,20 @@ def chirp(
 def sample_times(duration: float, sample_period: float) -> Signal:
     """Return the sampling instants 0, T, 2 T, ... in s, `[time]`: round(duration/T) of them.
 
-    Raises ValueError unless both are positive and finite and the duration is at least one sample period.
+    Raises ValueError unless both are positive and finite, the duration is at least one sample period, and the samples
+    are at most 1e8.
     """
-    _require_positive("duration", duration)
-    _require_positive("sample_period", sample_period)
+    positive("duration", duration)
+    positive("sample_period", sample_period)
     if duration < sample_period:
         raise ValueError(
             f"expected duration to be at least the sample period of {sample_period} s, got {duration} s; "
             "lengthen the one or shorten the other"
+        )
+    if duration / sample_period > _MOST_SAMPLES:
+        raise ValueError(
+            f"expected at most {_MOST_SAMPLES:g} samples, got {duration} s every {sample_period} s, "
+            f"{duration / sample_period:.3g}: shorten the duration or lengthen the sample period (both in s)"
         )
     return sample_period * np.arange(round(duration / sample_period), dtype=np.float64)
 
@@ -156,7 +168,10 @@ def _hold_starts(
     key: PRNGKeyArray, hold_time: float | Sequence[float], duration: float, sample_period: float
 ) -> tuple[Float64[np.ndarray, " level"], Signal]:
     times = sample_times(duration, sample_period)
-    pair = tuple(hold_time) if isinstance(hold_time, Sequence) else (hold_time, hold_time)
+    if isinstance(hold_time, Sequence) and not isinstance(hold_time, str):
+        pair = tuple(hold_time)
+    else:
+        pair = (hold_time, hold_time)
     if len(pair) != 2:
         raise ValueError(
             f"expected hold_time to be a number or a pair (shortest, longest), got {len(pair)} numbers; "
@@ -191,27 +206,24 @@ def _uniform(key: PRNGKeyArray, count: int) -> Float64[np.ndarray, " draw"]:
 
 
 def _phases(key: PRNGKeyArray | None, phases: str, count: int) -> Float64[np.ndarray, " line"]:
-    if phases == "random":
+    if choice("phases", phases, ("random", "schroeder")) == "random":
         if key is None:
             raise ValueError("expected a key for random phases, got None; pass jax.random.key(seed)")
+        check_key(key)
         return 2.0 * math.pi * _uniform(key, count)
-    if phases == "schroeder":
-        if key is not None:
-            raise ValueError("expected no key for Schroeder phases, which are not random, got one; pass None")
-        line = np.arange(1, count + 1, dtype=np.float64)
-        return -math.pi * line * (line - 1.0) / count
-    raise ValueError(f"expected phases to be 'random' or 'schroeder', got {phases!r}; choose one")
+    if key is not None:
+        raise ValueError("expected no key for Schroeder phases, which are not random, got one; pass None")
+    line = np.arange(1, count + 1, dtype=np.float64)
+    return -math.pi * line * (line - 1.0) / count
 
 
 def _lines(
     frequencies_hz: Sequence[float] | Num[np.ndarray, " line"], sample_period: float
 ) -> Float64[np.ndarray, " line"]:
-    frequencies = np.asarray(frequencies_hz, dtype=np.float64)
-    if frequencies.ndim != 1 or not len(frequencies):
-        raise ValueError(
-            f"expected frequencies_hz to be a list of at least one frequency, got shape {frequencies.shape}; "
-            "give one number for each line"
-        )
+    if isinstance(frequencies_hz, str) or np.ndim(frequencies_hz) != 1 or not len(frequencies_hz):
+        remedy = "give one number for each line"
+        raise refused("frequencies_hz", "a list of at least one frequency", frequencies_hz, remedy)
+    frequencies = np.array([number("every one of frequencies_hz", f, remedy="give it in Hz") for f in frequencies_hz])
     for frequency in frequencies.tolist():
         _require_resolved("every one of frequencies_hz", frequency, sample_period)
     if len(np.unique(frequencies)) < len(frequencies):
@@ -222,8 +234,8 @@ def _lines(
 
 
 def _require_hold_time(hold_time: float, sample_period: float) -> None:
-    _require_positive("hold_time", hold_time)
-    _require_positive("sample_period", sample_period)
+    positive("hold_time", hold_time)
+    positive("sample_period", sample_period)
     # A hold of one period, computed by the caller, may fall short of it in the last bits.
     if hold_time < sample_period * (1.0 - 1e-9):
         raise ValueError(
@@ -233,20 +245,9 @@ def _require_hold_time(hold_time: float, sample_period: float) -> None:
 
 
 def _require_resolved(name: str, frequency: float, sample_period: float) -> None:
-    _require_positive(name, frequency)
+    positive(name, frequency)
     if frequency >= 0.5 / sample_period:
         raise ValueError(
             f"expected {name} to be below {0.5 / sample_period} Hz, half the sampling rate, "
             f"got {frequency} Hz; lower it or shorten the sample period"
         )
-
-
-def _require_positive(name: str, value: float) -> None:
-    if _require_finite(name, value) <= 0:
-        raise ValueError(f"expected {name} to be positive, got {value!r}; give a number above 0")
-
-
-def _require_finite(name: str, value: float) -> float:
-    if not isinstance(value, Real) or not math.isfinite(value):
-        raise ValueError(f"expected {name} to be a finite number, got {value!r}; give it in SI units")
-    return float(value)

@@ -1,17 +1,25 @@
 """Steady hydraulics of a spool valve: section 2 of the paper, equations (1) to (8).
 
 Pure functions of scalars or of arrays that broadcast against each other, SI units, safe under `jit`, `grad`
-and `vmap`. They may be traced, so nothing is checked at run time.
+and `vmap`. They may be traced, so that values are not checked; what is no number or does not broadcast is refused with
+a ValueError.
 
 Sources are the paper's equations and H. E. Merritt, Hydraulic Control Systems, Wiley 1967: chapter 3 for
 orifices and continuity, chapter 5 for spool valves.
 """
 
+import functools
+import inspect
 import math
+from collections.abc import Callable
+from typing import Any, ParamSpec
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
+
+from ehsvjax.checks import is_numeric, refused
 
 JET_ANGLE = math.radians(69.0)
 """Angle of the vena contracta to the spool axis, rad (paper, section 2.2)."""
@@ -28,7 +36,32 @@ BULK_MODULUS = 1.5e9
 Quantity = Real[ArrayLike, "*#batch"]
 Result = Float[Array, "*batch"]
 
+_Quantities = ParamSpec("_Quantities")
 
+
+def _of_quantities(function: Callable[_Quantities, Result]) -> Callable[_Quantities, Result]:
+    """Return the function with its arguments checked: real numbers or arrays of them, of shapes that broadcast."""
+    names = tuple(inspect.signature(function).parameters)
+
+    @functools.wraps(function)
+    def checked(*args: _Quantities.args, **kwargs: _Quantities.kwargs) -> Result:
+        given: dict[str, Any] = {**dict(zip(names, args, strict=False)), **kwargs}
+        for name, value in given.items():
+            if not is_numeric(value) or jnp.iscomplexobj(value):
+                raise refused(name, "a real number or an array of them", value, "give it in SI units")
+        shapes = {name: np.shape(value) for name, value in given.items()}
+        try:
+            np.broadcast_shapes(*shapes.values())
+        except ValueError:
+            raise refused(
+                "shapes", "such that they broadcast", shapes, "give arrays of one shape, or scalars"
+            ) from None
+        return function(*args, **kwargs)
+
+    return checked
+
+
+@_of_quantities
 def orifice_flow(discharge_coefficient: Quantity, area: Quantity, density: Quantity, pressure_drop: Quantity) -> Result:
     """Turbulent flow through an orifice, m^3/s; a negative drop drives it backwards.
 
@@ -39,6 +72,7 @@ def orifice_flow(discharge_coefficient: Quantity, area: Quantity, density: Quant
     return signed_sqrt(2.0 / density * pressure_drop) * discharge_coefficient * area
 
 
+@_of_quantities
 def valve_flow_gain(discharge_coefficient: Quantity, area_gradient: Quantity, density: Quantity) -> Result:
     """Hydraulic constant H = Cd w / sqrt(rho) of a valve, m^2.5 kg^-0.5.
 
@@ -48,6 +82,7 @@ def valve_flow_gain(discharge_coefficient: Quantity, area_gradient: Quantity, de
     return jnp.divide(discharge_coefficient * area_gradient, jnp.sqrt(density))
 
 
+@_of_quantities
 def load_flow(flow_gain: Quantity, spool: Quantity, supply_pressure: Quantity, load_pressure: Quantity) -> Result:
     """Flow to the load of an ideal critical-centre four-way valve, m^3/s.
 
@@ -60,6 +95,7 @@ def load_flow(flow_gain: Quantity, spool: Quantity, supply_pressure: Quantity, l
     return signed_sqrt(supply_pressure - jnp.sign(spool) * load_pressure) * flow_gain * spool
 
 
+@_of_quantities
 def flow_gain_coefficient(
     flow_gain: Quantity, spool: Quantity, supply_pressure: Quantity, load_pressure: Quantity
 ) -> Result:
@@ -67,6 +103,7 @@ def flow_gain_coefficient(
     return _load_flow_derivative(1, flow_gain, spool, supply_pressure, load_pressure)
 
 
+@_of_quantities
 def flow_pressure_coefficient(
     flow_gain: Quantity, spool: Quantity, supply_pressure: Quantity, load_pressure: Quantity
 ) -> Result:
@@ -77,6 +114,7 @@ def flow_pressure_coefficient(
     return -_load_flow_derivative(3, flow_gain, spool, supply_pressure, load_pressure)
 
 
+@_of_quantities
 def linearised_load_flow(
     flow_gain: Quantity,
     spool: Quantity,
@@ -100,12 +138,17 @@ def normalised_pressure_flow_curves(
 ) -> Float[Array, "curve point"]:
     """Figure 1 of the paper: Q/Qmax, with Qmax = H xv_max sqrt(Ps), one curve for each spool opening.
 
-    Spool fractions xv/xv_max, pressure fractions PL/Ps; all dimensionless.
+    Spool fractions xv/xv_max, pressure fractions PL/Ps; all dimensionless. ValueError for what is no row of numbers.
     """
+    for name, row in (("spool_fractions", spool_fractions), ("pressure_fractions", pressure_fractions)):
+        numbers = np.asarray(row) if isinstance(row, list | tuple) else row
+        if not is_numeric(numbers) or np.ndim(numbers) != 1 or jnp.iscomplexobj(numbers):
+            raise refused(name, "a row of real numbers", row, "give one number for each curve or point")
     spool, load_pressure = jnp.asarray(spool_fractions), jnp.asarray(pressure_fractions)
     return load_flow(1.0, spool[:, None], 1.0, load_pressure[None, :])
 
 
+@_of_quantities
 def steady_flow_force(
     discharge_coefficient: Quantity,
     velocity_coefficient: Quantity,
@@ -121,6 +164,7 @@ def steady_flow_force(
     return 2.0 * jnp.cos(jet_angle) * discharge_coefficient * velocity_coefficient * area * pressure_drop
 
 
+@_of_quantities
 def flow_force_stiffness(area_gradient: Quantity, pressure_drop: Quantity) -> Result:
     """Stiffness K_f of the steady flow force of one orifice, F1 = K_f xv, N/m, with the paper's coefficients.
 
@@ -131,6 +175,7 @@ def flow_force_stiffness(area_gradient: Quantity, pressure_drop: Quantity) -> Re
     return steady_flow_force(DISCHARGE_COEFFICIENT, VELOCITY_COEFFICIENT, area_gradient, pressure_drop, JET_ANGLE)
 
 
+@_of_quantities
 def continuity_flow(volume: Quantity, volume_rate: Quantity, pressure_rate: Quantity, bulk_modulus: Quantity) -> Result:
     """Net flow into a chamber of variable volume, m^3/s: sum Q = dV/dt + (V/beta) dP/dt.
 
@@ -143,6 +188,7 @@ def continuity_flow(volume: Quantity, volume_rate: Quantity, pressure_rate: Quan
     return constant_chamber_flow(volume, pressure_rate, bulk_modulus) + volume_rate
 
 
+@_of_quantities
 def constant_chamber_flow(volume: Quantity, pressure_rate: Quantity, bulk_modulus: Quantity) -> Result:
     """Net flow into a chamber of constant volume, m^3/s: sum Q = C_H dP/dt. Paper, equation (8).
 
@@ -151,6 +197,7 @@ def constant_chamber_flow(volume: Quantity, pressure_rate: Quantity, bulk_modulu
     return hydraulic_capacitance(volume, bulk_modulus) * pressure_rate
 
 
+@_of_quantities
 def hydraulic_capacitance(volume: Quantity, bulk_modulus: Quantity) -> Result:
     """Hydraulic capacitance C_H = V/beta of a chamber, m^3/Pa. Paper, section 2.3, below equation (8).
 
@@ -159,6 +206,7 @@ def hydraulic_capacitance(volume: Quantity, bulk_modulus: Quantity) -> Result:
     return jnp.divide(volume, bulk_modulus)
 
 
+@_of_quantities
 def signed_sqrt(pressure: Quantity) -> Result:
     """Odd continuation of the square root, sgn(p) sqrt|p|.
 

@@ -12,12 +12,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from ehsvjax.checks import function, name_of, same_structure
+
 # Alexander's two-stage, second-order, L-stable, stiffly accurate SDIRK method (SIAM J. Numer. Anal. 14, 1977):
 # stages at GAMMA and 1, both implicit with the same GAMMA.
 SDIRK_GAMMA = 1.0 - 0.5 * 2.0**0.5
 
 
-@functools.cache
 def runge_kutta_4(derivative: Callable) -> Callable:
     """Return the `stepper` of a model by the classical Runge-Kutta method of order 4.
 
@@ -28,11 +29,20 @@ def runge_kutta_4(derivative: Callable) -> Callable:
     Returns:
         `stepper(parameters, step_size, signal) -> step`, the same object for the same derivative.
 
-    """
+    Raises:
+        ValueError: for what is no function; and, where it is traced, for rates that are not those of the state.
 
+    """
+    return _runge_kutta_4(function("derivative", derivative, "derivative(parameters, state, inputs, signal) -> rates"))
+
+
+@functools.cache
+def _runge_kutta_4(derivative: Callable) -> Callable:
     def stepper(parameters, step_size, signal):
         def rates(state, inputs):
-            return derivative(parameters, state, inputs, signal)
+            found = derivative(parameters, state, inputs, signal)
+            same_structure(f"the rates that {name_of(derivative)} returns", found, "the state", state)
+            return found
 
         def moved(state, rate, by):
             return jax.tree.map(lambda s, r: s + by * r, state, rate)

@@ -13,7 +13,6 @@ the bounds and make a parameter look as if its search interval were too narrow.
 
 import functools
 import inspect
-import math
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -21,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
 from ehsvjax import draws
+from ehsvjax.checks import number, refused, whole
 
 Population = Float[Array, "individual parameter"]
 Progress = Float[Array, ""] | float
@@ -45,7 +45,10 @@ def _same_for_equal_settings(factory: Callable[_Settings, _Operator]) -> Callabl
     def remembered(*args: _Settings.args, **kwargs: _Settings.kwargs) -> _Operator:
         settings = signature.bind(*args, **kwargs)
         settings.apply_defaults()
-        return cached(*settings.args, **settings.kwargs)
+        try:
+            return cached(*settings.args, **settings.kwargs)
+        except TypeError:  # what cannot be hashed the factory refuses by itself
+            return factory(*settings.args, **settings.kwargs)
 
     return remembered
 
@@ -58,7 +61,7 @@ def blend_crossover(extent: float = 0.5) -> Crossover:
     ValueError unless `extent` is from 0 to 1.
     Source: Eshelman & Schaffer 1993, Real-coded genetic algorithms and interval-schemata.
     """
-    _check(0 <= extent <= 1, "extent", "from 0 to 1 (0.5 is usual)", extent)
+    number("extent", extent, "from 0 to 1 (0.5 is usual)", lambda x: 0 <= x <= 1)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
         weights = draws.uniform(key, mothers.shape, mothers.dtype, -extent, 1 + extent)
@@ -76,7 +79,7 @@ def line_crossover(extent: float = 0.25) -> Crossover:
     ValueError unless `extent` is from 0 to 1.
     Source: Muehlenbein & Schlierkamp-Voosen 1993, Predictive models for the breeder genetic algorithm.
     """
-    _check(0 <= extent <= 1, "extent", "from 0 to 1 (0.25 is usual)", extent)
+    number("extent", extent, "from 0 to 1 (0.25 is usual)", lambda x: 0 <= x <= 1)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
         weights = draws.uniform(key, (len(mothers), 1), mothers.dtype, -extent, 1 + extent)
@@ -95,8 +98,8 @@ def simulated_binary_crossover(distribution_index: float = 2.0, probability: flo
     ValueError unless the index is finite and at least 0 and the probability is from 0 to 1.
     Source: Deb & Agrawal 1995, Simulated binary crossover for continuous search space.
     """
-    _check(0 <= distribution_index < math.inf, "distribution_index", "finite and at least 0", distribution_index)
-    _check(0 <= probability <= 1, "probability", "from 0 to 1", probability)
+    number("distribution_index", distribution_index, "finite and at least 0", lambda x: x >= 0)
+    number("probability", probability, "from 0 to 1", lambda x: 0 <= x <= 1)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
         key_child, key_parameters = draws.split(key, 2)
@@ -120,7 +123,7 @@ def differential_crossover(weight: float = 0.5) -> Crossover:
     ValueError unless 0 < weight <= 1.
     Source: Storn & Price 1997, Differential evolution, with the dither of Das, Konar & Chakraborty 2005.
     """
-    _check(0 < weight <= 1, "weight", "above 0 and at most 1 (0.5 is usual)", weight)
+    number("weight", weight, "above 0 and at most 1 (0.5 is usual)", lambda x: 0 < x <= 1)
 
     def crossover(key: Key[Array, ""], mothers: Population, fathers: Population) -> Population:
         share = draws.uniform(key, (len(mothers), 1), mothers.dtype, 0.5 * weight, 1.5 * weight)
@@ -140,10 +143,11 @@ def gaussian_mutation(
     ValueError unless 0 < final_deviation <= deviation <= 1 and the probability is from 0 to 1.
     Source: Baeck & Schwefel 1993, An overview of evolutionary algorithms for parameter optimization.
     """
+    number("deviation", deviation, "above 0 and at most 1 (the whole search interval)", lambda x: 0 < x <= 1)
     final = deviation / 100 if final_deviation is None else final_deviation
-    _check(0 < deviation <= 1, "deviation", "above 0 and at most 1 (the whole search interval)", deviation)
-    _check(0 < final <= deviation, "final_deviation", f"above 0 and at most the deviation {deviation}", final)
-    _check(probability is None or 0 <= probability <= 1, "probability", "None or from 0 to 1", probability)
+    at_most = f"above 0 and at most the deviation {deviation}"
+    number("final_deviation", final, at_most, lambda x: 0 < x <= deviation)
+    _check_probability(probability)
 
     def mutation(key: Key[Array, ""], individuals: Population, progress: Progress) -> Population:
         which, uniform = draws.uniform(key, (2, *individuals.shape), individuals.dtype)
@@ -163,8 +167,8 @@ def polynomial_mutation(distribution_index: float = 20.0, probability: float | N
     ValueError unless the index is finite and at least 0 and the probability is from 0 to 1.
     Source: Deb & Goyal 1996, A combined genetic adaptive search (GeneAS) for engineering design.
     """
-    _check(0 <= distribution_index < math.inf, "distribution_index", "finite and at least 0", distribution_index)
-    _check(probability is None or 0 <= probability <= 1, "probability", "None or from 0 to 1", probability)
+    number("distribution_index", distribution_index, "finite and at least 0", lambda x: x >= 0)
+    _check_probability(probability)
 
     def mutation(key: Key[Array, ""], individuals: Population, progress: Progress) -> Population:
         which, uniform = draws.uniform(key, (2, *individuals.shape), individuals.dtype)
@@ -181,10 +185,10 @@ def tournament_selection(size: int = 2) -> Selection:
 
     Of N individuals, rank r = 0 (best) to N - 1 is selected with probability
     ((N - r)^size - (N - r - 1)^size) / N^size.
-    ValueError unless `size` is a whole number of at least 1.
+    ValueError unless `size` is a whole number from 1 to 1000.
     Source: Goldberg & Deb 1991, A comparative analysis of selection schemes used in genetic algorithms.
     """
-    _check(size >= 1 and size % 1 == 0, "size", "a whole number of at least 1 (2 is usual)", size)
+    number("size", size, "a whole number from 1 to 1000 (2 is usual)", lambda x: 1 <= x <= 1000 and x % 1 == 0)
 
     def selection(key: Key[Array, ""], cost: Float[Array, " individual"], count: int) -> Int[Array, " count"]:
         rivals = draws.integers(key, (count, int(size)), len(cost))
@@ -204,7 +208,7 @@ def rank_selection(pressure: float = 1.8) -> Selection:
     ValueError unless `pressure` is from 1 (no preference) to 2.
     Source: Baker 1985, Adaptive selection methods for genetic algorithms.
     """
-    _check(1 <= pressure <= 2, "pressure", "from 1 to 2 (1.8 is usual)", pressure)
+    number("pressure", pressure, "from 1 to 2 (1.8 is usual)", lambda x: 1 <= x <= 2)
 
     def selection(key: Key[Array, ""], cost: Float[Array, " individual"], count: int) -> Int[Array, " count"]:
         ranked = jnp.isfinite(cost)
@@ -252,10 +256,16 @@ def elitism(
     An elite is present if an individual has its parameters and its cost. Absent elites replace distinct
     individuals, never one that stands for a present elite; an elite that failed replaces nobody. The elites
     are to be the best so far, this population included, or a better newcomer could be replaced.
-    ValueError if there are more elites than individuals.
+    ValueError if there are more elites than individuals, or shapes that do not go together.
     Source: the paper, section 3.1 (iv), with one elite.
     """
-    individuals = len(population)
+    draws.check_key(key)
+    individuals, parameters = _rows("population", population)
+    if _rows("elites", elites)[1] != parameters:
+        raise refused("elites", f"rows of {parameters} parameters, as the population's", elites)
+    for name, costs, count in (("cost", cost, individuals), ("elite_cost", elite_cost, len(elites))):
+        if getattr(costs, "shape", None) != (count,):
+            raise refused(name, f"an array of {count} costs, one for each row", costs)
     if len(elites) > individuals:
         raise ValueError(
             f"expected at most as many elites as individuals, got {len(elites)} elites "
@@ -282,8 +292,9 @@ def immigrants(key: Key[Array, ""], population: Population, count: int) -> Popul
     ValueError unless `count` is from 0 to the number of individuals.
     Source: the paper, section 3.1.
     """
-    individuals, parameters = population.shape
-    _check(0 <= count <= individuals, "count", f"from 0 to {individuals} (the number of individuals)", count)
+    draws.check_key(key)
+    individuals, parameters = _rows("population", population)
+    whole("count", count, 0, individuals, "at most the number of individuals")
     uniform = draws.uniform(key, (individuals + count * parameters,), population.dtype)
     place = jnp.argsort(uniform[:individuals])[:count]
     return population.at[place].set(uniform[individuals:].reshape(count, parameters))
@@ -315,6 +326,14 @@ def _spin_wheel(key: Key[Array, ""], weights: Float[Array, " individual"], count
     return order[jnp.minimum(positions, jnp.count_nonzero(weights) - 1)]
 
 
-def _check(valid: bool, name: str, wanted: str, value: object) -> None:
-    if not valid:
-        raise ValueError(f"expected {name} to be {wanted}, got {value!r}")
+def _rows(name: str, values: object) -> tuple[int, int]:
+    """Return the shape of rows of parameters."""
+    shape: tuple[int, ...] = getattr(values, "shape", ())
+    if len(shape) != 2:
+        raise refused(name, "an array [individual, parameter]", values)
+    return shape[0], shape[1]
+
+
+def _check_probability(probability: float | None) -> None:
+    if probability is not None:
+        number("probability", probability, "None or from 0 to 1", lambda x: 0 <= x <= 1)

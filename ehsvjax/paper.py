@@ -16,6 +16,8 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Array, Key
 
+from ehsvjax.checks import number, several
+from ehsvjax.draws import check_key
 from ehsvjax.excitation import pseudo_random_signal, sample_times
 from ehsvjax.fit import Fit
 from ehsvjax.identify import identify
@@ -119,6 +121,7 @@ def identify_van_der_pol(
     progress: bool = False,
 ) -> Identification:
     """Identify the oscillator from a record of its own, with the paper's sizes and bounds of +-50%."""
+    check_key(key)
     noise_key, search_key = jax.random.split(key)
     noisy, clean = (van_der_pol_record(noise_key, variance) for variance in (noise_variance, 0.0))
     sizes = {"population": population, "generations": generations}
@@ -134,6 +137,7 @@ def identify_servovalve(
     progress: bool = False,
 ) -> Identification:
     """Identify the servovalve from a record of its own, with the paper's sizes and bounds of +-50%."""
+    check_key(key)
     noise_key, search_key = jax.random.split(key)
     noisy, clean = (servovalve_record(noise_key, variance) for variance in (noise_variance, 0.0))
     sizes = {"population": population, "generations": generations}
@@ -193,8 +197,8 @@ def _record(
     substeps: int,
 ) -> Record:
     """Simulate at finer steps than an identification takes: its data should not come from its own discretisation."""
-    if not 0.0 <= noise_variance < math.inf:
-        raise ValueError(f"expected a noise variance of zero or more, got {noise_variance!r}")
+    check_key(key)
+    number("noise_variance", noise_variance, "zero or more", lambda x: x >= 0.0, "in the position's unit squared")
     excitation_key = jax.random.key(_EXCITATION_SEED)
     command = pseudo_random_signal(excitation_key, amplitude=amplitude, hold_time=hold_time, **timing)
     name = f"{model.name}, noise variance {noise_variance:g}{_squared(model.unit('position'))}"
@@ -223,6 +227,7 @@ def _table(
     truth: Mapping[str, float],
     printed: Mapping[float, Mapping[str, float]],
 ) -> pd.DataFrame:
+    several("identifications", identifications, Identification, "make each with identify_servovalve")
     unknown = [i.noise_variance for i in identifications if i.noise_variance not in printed]
     if unknown:
         variances = ", ".join(f"{variance:g}" for variance in printed)

@@ -5,10 +5,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ehsvjax.checks import number, positive, refused, whole
 from ehsvjax.population import Problem, huber_weight, population_cost, residuals, robust_square
 
 
@@ -63,7 +65,12 @@ def levenberg_marquardt(damping: float = 1e-4, shrink: float = 0.1) -> optax.Gra
         damping: of the first step.
         shrink: factor of the damping after a step that lowered the value.
 
+    Raises:
+        ValueError: unless the damping is positive and the factor is between 0 and 1.
+
     """
+    positive("damping", damping)
+    number("shrink", shrink, "between 0 and 1 (0.1 is usual)", lambda x: 0.0 < x < 1.0)
 
     def init(params):
         size = params.shape[0]
@@ -137,7 +144,15 @@ def refine(
             `optax.lbfgs()` works. None: `levenberg_marquardt()`.
         iterations: at most this many steps.
 
+    Raises:
+        ValueError: for starts that are no points of the problem's unit cube, or no number of steps.
+
     """
+    whole("iterations", iterations, 1, 10**6)
+    if np.shape(starts)[1:] != (problem.unknowns,):
+        raise refused(
+            "starts", f"an array [individual, {problem.unknowns}]", np.shape(starts), "one row for each start"
+        )
     optimizer = optax.with_extra_args_support(levenberg_marquardt() if optimizer is None else optimizer)
 
     def value_fn(params, information=None):

@@ -2,6 +2,7 @@
 
 import functools
 import math
+import warnings
 from collections.abc import Callable, Mapping
 from numbers import Integral
 from typing import Any, NamedTuple
@@ -12,9 +13,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ehsvjax.checks import by_name, function, instance, number
 from ehsvjax.integrators import repeated, scan_samples
+from ehsvjax.models.check import check_equations, where_not_finite
 from ehsvjax.models.model import Equations, Model, identity
 from ehsvjax.record import Record
+
+# Of one simulation: what takes minutes.
+_MOST_STEPS = 10**9
 
 
 class Grid(NamedTuple):
@@ -53,11 +59,16 @@ def simulate(
         every output of the model at the record's sample times, by name, in SI units.
 
     Raises:
-        ValueError: for an unknown parameter, an input that the record lacks, or substeps below 1.
+        ValueError: for an unknown parameter, a value that is no finite number, an input that the record lacks, substeps
+            below 1, or equations that cannot be simulated (`ehsvjax.models.check`). A simulation that is not finite
+            from its start is no error but a warning that says what is not.
 
     """
-    values = _changed(model, "parameters", model.nominal, parameters)
-    start = _changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
+    instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
+    instance("record", record, Record, "make one with Record or Record.from_csv")
+    function("signal", signal, "signal(name, value, **context) -> value")
+    values = changed(model, "parameters", model.nominal, parameters)
+    start = changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
     grid = grid_of(model, record, substeps)
     inputs = input_array(model, record)
     with jax.enable_x64(True):
@@ -71,25 +82,37 @@ def simulate(
             jnp.asarray(inputs),
             jnp.float64(record.sample_period),
         )
-    return {name: np.asarray(outputs[name]) for name in model.outputs}
+    found = {name: np.asarray(outputs[name]) for name in model.outputs}
+    if not all(np.isfinite(series[:2]).all() for series in found.values()):
+        step_size = record.sample_period / grid.substeps
+        warnings.warn(where_not_finite(model, signal, values, start, inputs, step_size), stacklevel=2)
+    return found
 
 
-def _changed(
+def changed(
     model: Model, kind: str, nominal: Mapping[str, float], changes: Mapping[str, float] | None
 ) -> dict[str, float]:
-    for name in changes or {}:
+    """Return nominal values with changes; `kind` says what they are, "parameters" or "initial conditions".
+
+    Raises:
+        ValueError: for a name that is none of the nominal ones', or a value that is no finite number.
+
+    """
+    changes = by_name(kind, changes, "{'mass': 20.0}")
+    for name, value in changes.items():
         model.parameter(name)
         if name not in nominal:
             known = ", ".join(nominal) or "none"
             raise ValueError(f"expected one of the {kind} of {model.name} here, got {name!r}; they are {known}")
-    return {**nominal, **(changes or {})}
+        changes[name] = number(name, value, remedy="give its value, SI")
+    return {**nominal, **changes}
 
 
 def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
     """Return the steps per sample that the model's `max_step` asks for, with the record's hold.
 
     Raises:
-        ValueError: for substeps that are not a positive whole number.
+        ValueError: for substeps that are not a positive whole number, or so many that a simulation would take minutes.
 
     """
     if substeps is None:
@@ -97,6 +120,11 @@ def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
         substeps = max(1, math.ceil(record.sample_period / model.max_step * (1.0 - 1e-3)))
     if isinstance(substeps, bool) or not isinstance(substeps, Integral) or substeps < 1:
         raise ValueError(f"expected substeps to be a whole number of at least 1, got {substeps!r}")
+    if substeps * len(record) > _MOST_STEPS:
+        raise ValueError(
+            f"expected at most {_MOST_STEPS:g} integration steps, got {len(record)} samples of {substeps:.3g} each: "
+            f"take fewer substeps, or a longer max_step of {model.name} ({model.max_step} s)"
+        )
     return Grid(int(substeps), record.hold)
 
 
@@ -104,16 +132,17 @@ def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]
     """Return the record's inputs in the model's order.
 
     Raises:
-        ValueError: if the record lacks an input of the model.
+        ValueError: if the record lacks an input of the model, or its equations cannot be simulated.
 
     """
+    check_equations(model)
     missing = [name for name in model.inputs if name not in record.inputs]
     if missing:
         raise ValueError(
             f"expected {record.name} to hold the inputs of {model.name}, {', '.join(model.inputs)}; it lacks "
             f"{', '.join(missing)} and has {', '.join(record.inputs) or 'none'}: name its columns accordingly"
         )
-    return np.stack([record.inputs[name] for name in model.inputs], axis=-1)
+    return np.array([record.inputs[name] for name in model.inputs], float).reshape(len(model.inputs), len(record)).T
 
 
 def scan_model(

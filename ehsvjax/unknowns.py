@@ -41,7 +41,7 @@ def problem_of(
     unknowns = [model.parameter(name) for name in model.free]
     for record in records:
         unknowns += [_around_first_samples(model.parameter(name), record) for name in free_initial]
-    _check_enough_samples(records, samples.measured, unknowns)
+    _check_enough_samples(model, records, samples.measured, unknowns)
     return Problem(
         samples=samples,
         noise_variance=_variances(model, records, observed, noise_variance),
@@ -141,10 +141,14 @@ def _checked_huber(huber):
     return None if huber is None else float(huber)
 
 
-def _check_enough_samples(records, measured, unknowns):
+def _check_enough_samples(model, records, measured, unknowns):
     count = int(np.sum(measured))
     if not unknowns:
-        raise ValueError("expected something to identify, got a model with every parameter fixed: free one by bounds")
+        names = ", ".join(p.name for p in model.parameters)
+        raise ValueError(
+            f"expected something to identify, got {model.name} with every parameter fixed: free one by "
+            f"bounds={{name: (lower, upper)}}, of {names}"
+        )
     if count <= len(unknowns):
         names = ", ".join(record.name for record in records)
         raise ValueError(

@@ -19,9 +19,8 @@ def _stepper(parameters, step_size, signal):
 
 
 def _measure(parameters, state, inputs, signal):
-    del signal
     force = parameters["gain"] * inputs["command"] + state["load"]
-    return {"force": force, "strain": 1e-3 * force}
+    return {"force": signal("force", force), "strain": signal("strain", 1e-3 * force)}
 
 
 def amplifier() -> Model:

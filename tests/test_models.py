@@ -283,7 +283,7 @@ def test_bounds_that_reach_zero_are_searched_on_a_linear_scale(lower, scale):
         ({"dead_zone": (1e-4, 1e-4)}, {}, r"to hold it at one value use fixed=\{'dead_zone': value\}"),
         ({"dead_zone": (1e-4, float("inf"))}, {}, "expected finite bounds of dead_zone"),
         ({"dead_zone": (float("nan"), 1e-4)}, {}, "expected finite bounds of dead_zone"),
-        ({}, {"dead_zone": float("nan")}, "expected a finite value for dead_zone, got nan"),
+        ({}, {"dead_zone": float("nan")}, "expected dead_zone to be a finite number, got nan: give its value, SI"),
         ({}, {"mass": -1.0}, "expected a positive value for mass, or zero, got -1.0: mind the sign"),
     ],
 )
@@ -333,8 +333,8 @@ def test_an_unknown_parameter():
             {"initial": (Parameter("x0", "x(0)", "m", 0.0, -1.0, 1.0, output="push"),)},
             "expected the output that shows x0 of .* of kind 'sensor', distance, spring_force; got 'push'",
         ),
-        ({"max_step": 0.0}, "expected max_step of oscillator to be positive seconds, got 0.0"),
-        ({"max_step": float("nan")}, "expected max_step of oscillator to be positive seconds, got nan"),
+        ({"max_step": 0.0}, "expected max_step of oscillator to be positive, got 0.0: give seconds above 0"),
+        ({"max_step": float("nan")}, "expected max_step of oscillator to be a finite number, got nan"),
     ],
 )
 def test_a_model_that_cannot_be(change, sentence):

@@ -80,7 +80,7 @@ def test_records_are_those_that_are_announced(make, variance, samples, held, amp
 
 @pytest.mark.parametrize("variance", [-0.1, math.nan, math.inf])
 def test_noise_variance_must_be_one(variance):
-    with pytest.raises(ValueError, match="expected a noise variance of zero or more, got"):
+    with pytest.raises(ValueError, match="expected noise_variance to be zero or more, got"):
         paper.van_der_pol_record(jax.random.key(0), variance)
 
 

@@ -99,7 +99,9 @@ def test_what_a_record_does_not_fix_has_no_bound():
 
 
 def test_refusals():
-    with pytest.raises(ValueError, match="expected the noise variance of each measured output"):
+    with pytest.raises(
+        ValueError, match="expected noise_variance of outputs of Van der Pol oscillator, position; got .speed"
+    ):
         ehsvjax.cramer_rao_bound(ehsvjax.van_der_pol(), OSCILLATOR, noise_variance={"speed": 1.0})
     record = ehsvjax.Record(OSCILLATOR.time, {}, OSCILLATOR.outputs)
     with pytest.raises(ValueError, match="it lacks command"):

@@ -4,6 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 
+from ehsvjax.checks import as_number, by_name, instance, several
 from ehsvjax.effects.effect import Candidate, Effect, candidates
 from ehsvjax.effects.extended import DURATION, extended
 from ehsvjax.effects.internal import contexts_of
@@ -32,6 +33,9 @@ def attach(
             a duration that is none or another than that of the model.
 
     """
+    instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
+    bank = several("bank", bank, Effect, "pass ehsvjax.effects.BANK, or (*BANK, my_effect)")
+    bounds = by_name("bounds", bounds, "{'sensor_bias.bias': (-1e-3, 1e-3)}")
     _check_duration(model, duration)
     if not bounds:
         raise ValueError(
@@ -67,7 +71,7 @@ def attach(
 
 
 def _check_duration(model: Model, duration: float) -> None:
-    if not (isinstance(duration, (int, float)) and 0.0 < duration < math.inf):
+    if not 0.0 < (as_number(duration) or 0.0) < math.inf:
         raise ValueError(f"expected the duration of the record, positive seconds, got {duration!r}")
     counted = model.nominal.get(DURATION, duration)
     if counted != duration:

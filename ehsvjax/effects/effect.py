@@ -4,7 +4,10 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ehsvjax.models.model import Model
+import numpy as np
+
+from ehsvjax.checks import as_number, by_name, function, instance, label, number, positive, refused, several, text
+from ehsvjax.models.model import KINDS, Model, check_kind
 
 Scales = Mapping[str, Any]
 """How large things are in a record: `value`, the largest size of the signal itself, and of each quantity of its
@@ -83,12 +86,14 @@ class Effect:
         return any(p.name == "frequency" for p in self.parameters)
 
     def __post_init__(self):
-        """Refuse an effect that could never vanish.
+        """Refuse an effect that could never vanish, and what cannot be an effect.
 
         Raises:
-            ValueError: if it has no number that makes it vanish, or two of one name.
+            ValueError: if it has no number that makes it vanish, or two of one name, a kind that is all but a known
+                one, or a field of another type.
 
         """
+        _check_fields(self)
         names = [p.name for p in self.parameters]
         if all(p.absent is None for p in self.parameters):
             raise ValueError(
@@ -97,6 +102,37 @@ class Effect:
             )
         if len(set(names)) < len(names):
             raise ValueError(f"expected every number of {self.name} to have its own name, got {', '.join(names)}")
+
+
+def _check_fields(effect: Effect) -> None:
+    if "@" in label("the name of an effect", effect.name):
+        raise refused("the name of an effect", "free of @, behind which a signal is named", effect.name, "leave it out")
+    check_kind(effect.name, effect.kind, (*KINDS, "parameter", "constant"))
+    several(
+        f"parameters of {effect.name}", effect.parameters, EffectParameter, "make each by amplitude(...) or shape(...)"
+    )
+    function(f"apply of {effect.name}", effect.apply, "apply(own, value, context) -> value")
+    for name in several(f"needs of {effect.name}", effect.needs, str, 'give names, such as ("position", "velocity")'):
+        label(f"every name in needs of {effect.name}", name)
+    if not isinstance(effect.memory, tuple | list) or None in map(as_number, effect.memory):
+        raise refused(
+            f"memory of {effect.name}", "a tuple of numbers", effect.memory, "give what it remembers at the start"
+        )
+    text(f"says of {effect.name}", effect.says)
+    text(f"settled_by of {effect.name}", effect.settled_by)
+    for number_of in effect.parameters:
+        where = f"of a number of {effect.name}"
+        if "." in label(f"the name {where}", number_of.name):
+            raise refused(
+                f"the name {where}", "free of points, behind which it is named", number_of.name, "leave it out"
+            )
+        text(f"the unit {where}", number_of.unit)
+        if number_of.absent is not None:
+            number(f"absent {where}", number_of.absent)
+        for field in ("lower", "upper", "tries"):
+            function(
+                f"{field} {where}", getattr(number_of, field), "of the scales: lambda scales: 0.1 * scales['value']"
+            )
 
 
 class Candidate(NamedTuple):
@@ -132,7 +168,21 @@ def candidates(
         contexts: for each signal that the model passes values through, the names in its context.
         observed: the outputs that are measured: an effect on the sensor of another could not show.
 
+    Raises:
+        ValueError: for what is no model, no effects, no mapping or no names.
+
     """
+    instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
+    bank = several("bank", bank, Effect, "pass ehsvjax.effects.BANK, or (*BANK, my_effect)")
+    contexts = by_name(
+        "contexts", instance("contexts", contexts, Mapping, "give names by signal"), "{'load': ['velocity']}"
+    )
+    if (
+        isinstance(observed, str)
+        or not isinstance(observed, Collection)
+        or not all(isinstance(o, str) for o in observed)
+    ):
+        raise refused("observed", "names of outputs", observed, "give them in a tuple")
     inputs = {input_named(name) for name in model.inputs}
 
     def takes(effect, signal):
@@ -189,7 +239,13 @@ def amplitude(
     lower: Callable[[Scales], float] = _no_less,
     upper: Callable[[Scales], float] = _no_more,
 ) -> EffectParameter:
-    """Return a number to which the effect is proportional, at least while it is small."""
+    """Return a number to which the effect is proportional, at least while it is small.
+
+    Raises:
+        ValueError: for a probe that is no function of the scales.
+
+    """
+    function("probe", probe, "of the scales: lambda scales: 1e-3 * scales['value']")
     return EffectParameter(name, unit, 0.0, lower, upper, lambda scales: (probe(scales),))
 
 
@@ -204,14 +260,26 @@ def size(
 
 
 def width(name: str, unit: str, tries: Sequence[float], upper: float = 0.5) -> EffectParameter:
-    """Return a width that is never negative and whose effect is not proportional to it; shares of the signal's size."""
+    """Return a width that is never negative and whose effect is not proportional to it; shares of the signal's size.
+
+    Raises:
+        ValueError: for tries that are no positive numbers, or an upper bound that is none.
+
+    """
+    tries, upper = _shares(tries), positive("upper", upper)
     return EffectParameter(
         name, unit, 0.0, constant(0.0), lambda s: upper * s["value"], lambda s: [t * s["value"] for t in tries]
     )
 
 
 def limit(name: str, unit: str, tries: Sequence[float], lower: float = 0.02) -> EffectParameter:
-    """Return a level that the signal does not pass; shares of the signal's size."""
+    """Return a level that the signal does not pass; shares of the signal's size.
+
+    Raises:
+        ValueError: for tries that are no positive numbers, or a lower bound that is not from 0 to 1.
+
+    """
+    tries, lower = _shares(tries), number("lower", lower, "from 0 to 1", lambda x: 0.0 <= x <= 1.0)
     return EffectParameter(
         name,
         unit,
@@ -220,6 +288,14 @@ def limit(name: str, unit: str, tries: Sequence[float], lower: float = 0.02) -> 
         lambda s: 1.02 * s["value"],
         lambda s: [t * s["value"] for t in tries],
     )
+
+
+def _shares(tries: Sequence[float]) -> list[float]:
+    if not isinstance(tries, tuple | list | np.ndarray) or not len(tries):
+        raise refused(
+            "tries", "a list of positive numbers", tries, "give shares of the signal's size, such as [0.01, 0.1]"
+        )
+    return [positive("each of tries", share, "give shares of the signal's size") for share in tries]
 
 
 def shape(

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
+from ehsvjax.checks import instance
 from ehsvjax.effects.effect import Candidate, input_named
 from ehsvjax.models.model import Equations, Model, Parameter, Signal, identity
 
@@ -74,7 +75,13 @@ def disturbance(signal: str) -> str:
 
 
 def effects_of(model: Model) -> tuple[str, ...]:
-    """Return the names of the effects that a model was extended by."""
+    """Return the names of the effects that a model was extended by.
+
+    Raises:
+        ValueError: for what is no model.
+
+    """
+    instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
     return tuple(name for key, names in model.options if key == "effects" for name in names)
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.models.check import check_equations
 from ehsvjax.models.model import Equations, Model, identity
 from ehsvjax.record import Record
 from ehsvjax.simulate import grid_of, simulate
@@ -52,7 +53,13 @@ def internal_signals(
 
 
 def contexts_of(model: Model) -> dict[str, tuple[str, ...]]:
-    """Return for each signal that a model passes values through the names of the quantities in its context."""
+    """Return for each signal that a model passes values through the names of the quantities in its context.
+
+    Raises:
+        ValueError: for equations that cannot be traced.
+
+    """
+    check_equations(model)
     contexts: dict[str, tuple[str, ...]] = {}
     for name in _names_of(model, _watched(model.equations, model.max_step)):
         signal, quantity = _parts(name)
@@ -65,7 +72,7 @@ def _watch_name(signal: str, quantity: str = "") -> str:
 
 
 def _parts(name: str) -> tuple[str, str]:
-    signal, _, quantity = name.removeprefix("along ").partition("|")
+    signal, _, quantity = name.removeprefix("along ").rpartition("|")
     return signal, quantity
 
 
@@ -99,6 +106,6 @@ def _watched(base: Equations, step_size: float) -> Equations:
 
         base.stepper(parameters, step_size, watching)(state, lambda fraction: inputs)
         outputs = base.measure(parameters, state, inputs, watching)
-        return outputs | {name: jnp.asarray(value, float) for name, value in seen.items()}
+        return outputs | {name: signal(name, jnp.asarray(value, float)) for name, value in seen.items()}
 
     return base._replace(measure=measure)

@@ -15,9 +15,26 @@ the context is what an effect there may depend on (a force: `position=`, `veloci
 A fourth, `prepare(parameters, inputs, sample_period) -> inputs`, may change the whole series of an input beforehand.
 """
 
-from collections.abc import Callable, Mapping
+import difflib
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from ehsvjax.checks import (
+    as_number,
+    by_name,
+    choice,
+    flag,
+    function,
+    label,
+    number,
+    positive,
+    refused,
+    several,
+    text,
+)
 
 State = Any
 Inputs = Callable[[float], dict[str, Any]]
@@ -44,13 +61,22 @@ class Parameter(NamedTuple):
     certain: bool = False
 
 
+KINDS = (
+    "input", "sensor", "force", "load", "friction", "storage", "displacement", "damping",
+    "feedback", "drive", "spool", "rate", "opening", "supply", "area", "leakage", "capacitance",
+)  # fmt: skip
+"""Kinds of signals at which effects of this package can act."""
+
+
 class Signal(NamedTuple):
     """A named line of the block diagram, with its kind and its unit.
 
     Lines of kind "input" are the model's inputs, lines of kind "sensor" its outputs. The kind says which effects can
     act there (`ehsvjax.effects`): a "force" drives the motion, a "load" resists it, "friction" is the size of a force
     against the velocity (a model steps it without chatter), "storage" is the rate at which something is stored (its
-    `level=` the context), a "displacement" is any other length.
+    `level=` the context), a "displacement" is any other length; `KINDS` has them all. A kind of your own, at which
+    effects of your own act, is any word that resembles none of them: one that is close to a known kind, "senzor", is
+    taken for a slip and refused.
     """
 
     name: str
@@ -84,9 +110,10 @@ class Model:
         options: how the model was made, for prints and for `Fit.save`.
 
     Raises:
-        ValueError: for names that repeat, bounds that are not in order, a value outside its bounds, a log scale with a
+        ValueError: for names that repeat or are none (empty, with blanks at their ends, of two lines), a kind of signal
+            that is all but a known one, bounds that are not in order, a value outside its bounds, a log scale with a
             bound that is not positive or a negative value, an initial condition shown by an output that there is not,
-            or a model without an output.
+            a model without an output, or a field of another type. What the equations do is checked at their first use.
 
     """
 
@@ -103,6 +130,7 @@ class Model:
 
     def __post_init__(self):
         """Refuse what cannot be a model."""
+        self._check_types()
         names = [p.name for p in (*self.parameters, *self.initial)]
         signals = [s.name for s in self.signals]
         for kind, found in (("parameter", names), ("signal", signals)):
@@ -113,13 +141,38 @@ class Model:
             raise ValueError(f"expected {self.name} to have an output, got no signal of kind 'sensor'")
         for parameter in (*self.parameters, *self.initial):
             check_bounds(parameter)
-            if parameter.output is not None and parameter.output not in self.outputs:
+            if parameter.output is not None and label("output", parameter.output) not in self.outputs:
                 raise ValueError(
                     f"expected the output that shows {parameter.name} of {self.name} to be a signal of kind 'sensor', "
                     f"{', '.join(self.outputs)}; got {parameter.output!r}"
                 )
-        if not self.max_step > 0:
-            raise ValueError(f"expected max_step of {self.name} to be positive seconds, got {self.max_step}")
+        positive(f"max_step of {self.name}", self.max_step, "give seconds above 0")
+
+    def _check_types(self):
+        label("the name of a model", self.name)
+        for field, kind, example in (
+            ("parameters", Parameter, 'Parameter("mass", "M", "kg", 20.0, 10.0, 30.0)'),
+            ("initial", Parameter, 'Parameter("position", "x(0)", "m", 0.0, -0.1, 0.1)'),
+            ("signals", Signal, 'Signal("position", "sensor", "m")'),
+        ):
+            given = several(f"{field} of {self.name}", getattr(self, field), kind, f"make each by {example}")
+            object.__setattr__(self, field, given)
+        several(f"options of {self.name}", self.options, tuple, "give pairs (name, value)")
+        for signal in self.signals:
+            label(f"the name of a signal of {self.name}", signal.name)
+            text(f"the unit of {signal.name}", signal.unit)
+            check_kind(signal.name, signal.kind, KINDS)
+        function(f"start of {self.name}", self.start, "start(parameters, initial, inputs) -> state")
+        function(f"stepper of {self.name}", self.stepper, "stepper(parameters, step_size, signal) -> step")
+        function(f"measure of {self.name}", self.measure, "measure(parameters, state, inputs, signal) -> outputs")
+        if self.prepare is not None:
+            function(f"prepare of {self.name}", self.prepare, "prepare(parameters, inputs, sample_period) -> inputs")
+        for equation in (self.start, self.stepper, self.measure, self.prepare):
+            try:
+                hash(equation)
+            except TypeError:
+                remedy = "compiled programs are kept by it; use functions, or frozen dataclasses"
+                raise refused(f"each equation of {self.name}", "something with a hash", equation, remedy) from None
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -155,7 +208,7 @@ class Model:
         """
         everything = (*self.parameters, *self.initial)
         for parameter in everything:
-            if parameter.name == name:
+            if isinstance(name, str) and parameter.name == name:
                 return parameter
         known = ", ".join(p.name for p in everything)
         raise ValueError(f"expected a parameter of {self.name}, got {name!r}; it has {known}")
@@ -168,7 +221,7 @@ class Model:
 
         """
         units = {s.name: s.unit for s in self.signals}
-        if signal not in units:
+        if not isinstance(signal, str) or signal not in units:
             raise ValueError(f"expected a signal of {self.name}, got {signal!r}; it has {', '.join(units)}")
         return units[signal]
 
@@ -180,10 +233,10 @@ class Model:
         """Return the model with other bounds (which frees a constant) and with parameters fixed at values.
 
         Raises:
-            ValueError: for an unknown name, a name in both, or bounds out of order.
+            ValueError: for an unknown name, a name in both, bounds out of order, or what is no number.
 
         """
-        bounds, fixed = dict(bounds or {}), dict(fixed or {})
+        bounds, fixed = by_name("bounds", bounds, '{"mass": (10.0, 30.0)}'), by_name("fixed", fixed, '{"mass": 20.0}')
         for name in (*bounds, *fixed):
             self.parameter(name)
         both = sorted(set(bounds) & set(fixed))
@@ -199,7 +252,7 @@ class Model:
                 # Bounds given for an initial condition stand, whatever its output shows.
                 return p._replace(lower=lower, upper=upper, value=value, fixed=False, scale=scale, output=None)
             if p.name in fixed:
-                return p._replace(value=float(fixed[p.name]), fixed=True)
+                return p._replace(value=number(p.name, fixed[p.name], remedy="give its value, SI"), fixed=True)
             return p
 
         return replace(
@@ -216,25 +269,44 @@ def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
         ValueError: if they are no such pair.
 
     """
-    try:
-        lower, upper = bounds
-        return float(lower), float(upper)
-    except (TypeError, ValueError):
-        raise ValueError(f"expected bounds of {name} as (lower, upper), got {bounds!r}") from None
+    given = map(as_number, bounds) if isinstance(bounds, tuple | list | np.ndarray) else ()
+    pair = [bound for bound in given if bound is not None]
+    if len(pair) != 2 or len(bounds) != 2:
+        raise ValueError(f"expected bounds of {name} as (lower, upper), got {bounds!r}: give two numbers, SI")
+    return pair[0], pair[1]
+
+
+def check_kind(name: str, kind: str, known: Collection[str]) -> None:
+    """Refuse a kind of signal that is close to a known one and is not that one.
+
+    Raises:
+        ValueError: with the known kinds and the closest one.
+
+    """
+    label(f"the kind of {name}", kind)
+    close = difflib.get_close_matches(kind.lower(), known, n=1, cutoff=0.75)
+    if kind not in known and close:
+        raise ValueError(
+            f"expected the kind of {name} to be one of {', '.join(known)}, got {kind!r}: write {close[0]!r}, or for a "
+            "kind of your own a word that resembles none of them"
+        )
 
 
 def check_bounds(parameter: Parameter) -> None:
-    """Refuse bounds out of order, a value outside them, and a log scale that reaches zero.
+    """Refuse bounds out of order, a value outside them, a log scale that reaches zero, and fields of another type.
 
     Raises:
         ValueError: with the parameter's name, what came, and what to do.
 
     """
     name, value, lower, upper = parameter.name, parameter.value, parameter.lower, parameter.upper
-    if parameter.scale not in ("linear", "log"):
-        raise ValueError(f"expected the scale of {name} to be 'linear' or 'log', got {parameter.scale!r}")
-    if not abs(value) < float("inf"):
-        raise ValueError(f"expected a finite value for {name}, got {value}")
+    label("the name of a parameter", name)
+    text(f"the symbol of {name}", parameter.symbol)
+    text(f"the unit of {name}", parameter.unit)
+    choice(f"the scale of {name}", parameter.scale, ("linear", "log"))
+    flag(f"fixed of {name}", parameter.fixed)
+    number(name, value, remedy="give its nominal value, SI")
+    as_bounds(name, (lower, upper))
     if parameter.scale == "log" and value < 0:
         raise ValueError(f"expected a positive value for {name}, or zero, got {value}: mind the sign")
     if parameter.fixed:

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 
 from ehsvjax import hydraulics
+from ehsvjax.checks import choice, flag, number
 from ehsvjax.integrators import SDIRK_GAMMA, second_order_filter
 from ehsvjax.models.model import Model, Parameter, Signal, identity
 
@@ -73,11 +74,13 @@ def servovalve(
 
     Raises:
         ValueError: for an unknown `transfer_function`, an open loop with a transfer function elsewhere than in the
-            valve, or a constant that is negative (zero where it divides).
+            valve, or a constant that is negative (zero where it divides) or so large or small that its unit must be
+            another one: a pressure of 140 Pa.
 
     """
-    if transfer_function not in ("valve", "forward", "return"):
-        raise ValueError(f"expected transfer_function 'valve', 'forward' or 'return', got {transfer_function!r}")
+    choice("transfer_function", transfer_function, ("valve", "forward", "return"))
+    flag("open_loop", open_loop)
+    flag("flow_force", flow_force)
     if open_loop and transfer_function != "valve":
         raise ValueError(f"expected transfer_function='valve' in open loop, got {transfer_function!r}")
     constants: tuple[Parameter, ...] = (
@@ -145,9 +148,13 @@ def servovalve(
 def _check_constants(constants):
     for constant in constants:
         may_be_zero = constant.name in ("stiffness", "hydraulic_capacitance", "leakage_coefficient")
-        if not (constant.value > 0 or (may_be_zero and constant.value == 0)):
-            bound = "zero or more" if may_be_zero else "positive"
-            raise ValueError(f"expected {constant.name} to be {bound} ({constant.unit}), got {constant.value}")
+        bound = f"{'zero or more' if may_be_zero else 'positive'} ({constant.unit})"
+        number(constant.name, constant.value, bound, lambda x, zero=may_be_zero: x > 0.0 or (zero and x == 0.0))
+        lower, upper, value = constant.lower, constant.upper, constant.value
+        if value > upper or (value < lower and not may_be_zero):
+            raise ValueError(
+                f"expected {constant.name} between {lower:g} and {upper:g} {constant.unit}, got {value}: mind the unit"
+            )
 
 
 class _Equations(NamedTuple):

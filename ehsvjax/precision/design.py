@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from ehsvjax.checks import by_name, instance, positive, several
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
 from ehsvjax.precision.sensitivities import sensitivities
 from ehsvjax.precision.standard_errors import Precision, covariance_of, linearised, precision_of
 from ehsvjax.record import Record
-from ehsvjax.simulate import simulate
+from ehsvjax.simulate import changed, simulate
 from ehsvjax.unknowns import Initial, problem_of
 
 
@@ -40,11 +41,7 @@ def design(
         ValueError: as `identify` does, and for an output that the model does not have.
 
     """
-    for name in noise_variance:
-        if name not in model.outputs:
-            known = ", ".join(model.outputs)
-            raise ValueError(f"expected noise_variance of outputs of {model.name}, {known}; got {name!r}")
-    records = (records,) if isinstance(records, Record) else tuple(records)
+    records = _checked(model, records, noise_variance)
     expected = []
     for record in records:
         simulated = simulate(model, record, parameters, initial_values)
@@ -84,7 +81,7 @@ def cramer_rao_bound(
         ValueError: as `identify` does.
 
     """
-    records = (records,) if isinstance(records, Record) else tuple(records)
+    records = _checked(model, records, noise_variance)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance)
     found = sensitivities(problem, _point(model, problem, parameters, initial_values))
     covariance, seen = covariance_of(found, None, 1.0)
@@ -92,9 +89,28 @@ def cramer_rao_bound(
     return {name: float(deviation) for name, deviation in zip(problem.free, deviations, strict=False)}
 
 
+def _checked(model: Model, records, noise_variance) -> tuple[Record, ...]:
+    """Return the records as a tuple, once they, the model and the variances can be meant."""
+    instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
+    records = (records,) if isinstance(records, Record) else records
+    if not several("records", records, Record, "make each with Record or Record.from_csv"):
+        raise ValueError("expected records to be one at least, got none: plan an experiment with Record(time, inputs)")
+    given = by_name("noise_variance", noise_variance, "{'position': 1e-8}")
+    known = ", ".join(model.outputs)
+    if not given:
+        raise ValueError(
+            f"expected noise_variance of each output that is measured, of {known}; got none: give it by name"
+        )
+    for name, variance in given.items():
+        if name not in model.outputs:
+            raise ValueError(f"expected noise_variance of outputs of {model.name}, {known}; got {name!r}")
+        positive(f"noise_variance of {name}", variance, f"give it in the unit of {name} squared")
+    return tuple(records)
+
+
 def _point(model: Model, problem: Problem, parameters, initial_values) -> np.ndarray:
-    values = model.nominal | dict(parameters or {})
-    start = {p.name: p.value for p in model.initial} | dict(initial_values or {})
+    values = changed(model, "parameters", model.nominal, parameters)
+    start = changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial_values)
     count = len(problem.samples.inputs)
     return np.array(
         [values[name] for name in problem.free] + [start[name] for _ in range(count) for name in problem.free_initial]
