@@ -2,6 +2,7 @@
 
 import functools
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -9,8 +10,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.arguments import by_name, instance, number
+from ehsvjax.failure import failure_of
 from ehsvjax.models.model import Model
 from ehsvjax.record import Record
+from ehsvjax.score import Score, differences, score_of
 from ehsvjax.simulate import simulate
 
 if TYPE_CHECKING:
@@ -18,21 +22,6 @@ if TYPE_CHECKING:
 
     from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
     from ehsvjax.precision.of_fit import Prepared
-
-
-class Score(NamedTuple):
-    """How well outputs are reproduced, by name of the output.
-
-    Attributes:
-        rmse: root of the mean squared error, in the output's unit.
-        fit_percent: 100*(1 - ||y - ym|| / ||y - mean(y)||), MATLAB's fit: 100 is perfect, 0 no better than the mean.
-        cost: equation (9) of the paper, the integral of the squared error, in the output's unit squared times s.
-
-    """
-
-    rmse: dict[str, float]
-    fit_percent: dict[str, float]
-    cost: dict[str, float]
 
 
 class History(NamedTuple):
@@ -157,35 +146,57 @@ class Fit:
                 record of the fit), or taken as "nominal", or given by name.
 
         Returns:
-            every output of the model by name, `[time]`, SI.
+            every output of the model by name, `[time]`, SI; a `RuntimeWarning` says where it is not finite.
 
         Raises:
-            ValueError: if the record lacks an input, or has no output to estimate initial conditions from.
+            ValueError: for what is no record, one that lacks an input, or one without an output to estimate initial
+                conditions from.
 
         """
-        return simulate(self.model, record, self.parameters, self.initial_of(record, initial))
+        simulated = simulate(self.model, record, self.parameters, self.initial_of(record, initial))
+        failure = failure_of(record, simulated)
+        if failure is not None:
+            warnings.warn(
+                f"the simulation of {self.model.name} on {record.name} fails: {failure}; mind the units of its inputs, "
+                "its initial conditions and max_step",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+        return simulated
 
     def residuals(
         self, record: Record | None = None, initial: Mapping[str, float] | str = "estimate"
     ) -> dict[str, Float[np.ndarray, " time"]]:
-        """Measured minus simulated of each output that the record holds, `[time]`, SI; NaN for missing samples.
+        """Measured minus simulated of each output that the record holds, `[time]`, SI.
+
+        NaN for missing readings, +inf for those where the simulation is not finite: no model is good where it fails.
 
         Args:
             record: by default the first that was fitted.
             initial: as for `simulate`.
 
+        Raises:
+            ValueError: as `simulate` does, and for an output that the model does not have.
+
         """
-        record = self.records[0] if record is None else record
+        record = self.records[0] if record is None else checked_record(record)
+        unknown = [name for name in record.outputs if name not in self.model.outputs]
+        if unknown:
+            raise ValueError(
+                f"expected the outputs of {record.name} to be among those of {self.model.name}, "
+                f"{', '.join(self.model.outputs)}; got {', '.join(unknown)}: name its columns accordingly, or drop "
+                "them with .select"
+            )
         simulated = self.simulate(record, initial)
-        return {name: measured - simulated[name] for name, measured in record.outputs.items()}
+        return {name: differences(measured, simulated[name]) for name, measured in record.outputs.items()}
 
     def score(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> Score:
-        """Judge the prediction of one record, fitted or new; arguments as for `simulate`."""
-        return _score([record], [self.residuals(record, initial)])
+        """Judge the prediction of one record, fitted or new; arguments and refusals as for `residuals`."""
+        return score_of([record], [self.residuals(record, initial)])
 
     @functools.cached_property
     def _score(self) -> Score:
-        return _score(self.records, [self.residuals(record) for record in self.records])
+        return score_of(self.records, [self.residuals(record) for record in self.records])
 
     def initial_of(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> dict[str, float]:
         """Return the initial conditions, name -> value, with which `simulate` starts; arguments as there.
@@ -196,13 +207,17 @@ class Fit:
             ValueError: as `simulate` does.
 
         """
-        for name in initial if not isinstance(initial, str) else ():
-            if name not in {p.name for p in self.model.initial}:
-                known = ", ".join(p.name for p in self.model.initial) or "none"
-                raise ValueError(f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}")
+        checked_record(record)
         nominal = {p.name: p.value for p in self.model.initial}
         if not isinstance(initial, str):
-            return nominal | dict(initial)
+            given = by_name("initial conditions", initial)
+            for name in given:
+                if name not in nominal:
+                    known = ", ".join(nominal) or "none"
+                    raise ValueError(
+                        f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}"
+                    )
+            return nominal | {name: number(name, value) for name, value in given.items()}
         if initial == "nominal":
             return nominal
         if initial != "estimate":
@@ -363,15 +378,11 @@ class Fit:
         return load_fit(path, model)
 
 
-def _score(records: Sequence[Record], residuals: Sequence[Mapping[str, Float[np.ndarray, " time"]]]) -> Score:
-    """Return the score of each output over records; a missing sample counts for nothing."""
-    names = dict.fromkeys(name for record in records for name in record.outputs)
-    rmse, fit_percent, cost = {}, {}, {}
-    for name in names:
-        pairs = [(r, e[name]) for r, e in zip(records, residuals, strict=True) if name in r.outputs]
-        errors = np.concatenate([error for _, error in pairs])
-        about_mean = np.concatenate([r.outputs[name] - np.nanmean(r.outputs[name]) for r, _ in pairs])
-        rmse[name] = float(np.sqrt(np.nanmean(errors**2)))
-        fit_percent[name] = float(100.0 * (1.0 - np.sqrt(np.nansum(errors**2) / np.nansum(about_mean**2))))
-        cost[name] = float(sum(np.nansum(error**2) * r.sample_period for r, error in pairs))
-    return Score(rmse, fit_percent, cost)
+def checked_record(record) -> Record:
+    """Return a record.
+
+    Raises:
+        ValueError: for anything else.
+
+    """
+    return instance("record", record, Record, "make one with Record.from_csv")

@@ -19,6 +19,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
+from ehsvjax.arguments import by_name, number
+
 State = Any
 Inputs = Callable[[float], dict[str, Any]]
 
@@ -28,7 +30,8 @@ class Parameter(NamedTuple):
 
     `value` is the nominal value, used where the parameter is fixed; `scale` says in which coordinate the search moves:
     "log" for positive quantities known by their order of magnitude. For an initial condition, `output` names the output
-    whose first samples tell about where it lies, if that output is measured.
+    whose first samples tell about where it lies, if that output is measured: the search begins there. The bounds stand,
+    but where those samples lie beyond them; bounds given to `identify` stand in any case.
     """
 
     name: str
@@ -177,10 +180,11 @@ class Model:
         """Return the model with other bounds (which frees a constant) and with parameters fixed at values.
 
         Raises:
-            ValueError: for an unknown name, a name in both, or bounds out of order.
+            ValueError: for an unknown name, a name in both, bounds that are no pair of numbers or out of order, or a
+                value that is no number.
 
         """
-        bounds, fixed = dict(bounds or {}), dict(fixed or {})
+        bounds, fixed = by_name("bounds", bounds), by_name("fixed values", fixed)
         for name in (*bounds, *fixed):
             self.parameter(name)
         both = sorted(set(bounds) & set(fixed))
@@ -196,7 +200,7 @@ class Model:
                 # Bounds given for an initial condition stand, whatever its output shows.
                 return p._replace(lower=lower, upper=upper, value=value, fixed=False, scale=scale, output=None)
             if p.name in fixed:
-                return p._replace(value=float(fixed[p.name]), fixed=True)
+                return p._replace(value=number(p.name, fixed[p.name]), fixed=True)
             return p
 
         return replace(
@@ -214,10 +218,10 @@ def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
 
     """
     try:
-        lower, upper = bounds
-        return float(lower), float(upper)
+        lower, upper = (number(f"a bound of {name}", end) for end in bounds)
     except (TypeError, ValueError):
-        raise ValueError(f"expected bounds of {name} as (lower, upper), got {bounds!r}") from None
+        raise ValueError(f"expected bounds of {name} as (lower, upper), two finite numbers, got {bounds!r}") from None
+    return lower, upper
 
 
 def check_bounds(parameter: Parameter) -> None:
