@@ -220,7 +220,7 @@ def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
     try:
         lower, upper = (number(f"a bound of {name}", end) for end in bounds)
     except (TypeError, ValueError):
-        raise ValueError(f"expected bounds of {name} as (lower, upper), two finite numbers, got {bounds!r}") from None
+        raise ValueError(f"expected finite bounds of {name} as (lower, upper), got {bounds!r}") from None
     return lower, upper
 
 
