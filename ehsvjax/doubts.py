@@ -29,6 +29,8 @@ _STEPS = 1000
 NO_CHANGE = 1e-6
 """Changes of the sum of squares, in noise variances, that are none."""
 _DECADES = (1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4)
+# Slope of readings over simulated ones from which on their unit is another.
+_OTHER_UNIT = 1.5
 _NORMAL_MEDIAN = 0.6744897501960817
 
 
@@ -155,7 +157,7 @@ def _variance(readings: Sequence[Float[np.ndarray, " time"]], robust: bool) -> f
 
 def _fit(share: float) -> str:
     percent = 100.0 * (1.0 - (1.0 - share) ** 0.5)
-    return f"fit {percent:.2g} %" if percent > -1000.0 else "fit below -1000 %"
+    return "fit below -1000 %" if percent < -1000.0 else f"fit {percent:.{0 if abs(percent) >= 10.0 else 2}f} %"
 
 
 class _Trial(NamedTuple):
@@ -177,31 +179,35 @@ def _what_would(model: Model, record: Record, parameters, start, name: str) -> s
 
 
 def _trials(model: Model, record: Record, parameters, start, name: str) -> Iterator[_Trial]:
-    """Yield single changes of sign, unit or offset, with the fitted and with the nominal parameters."""
-    unit = model.unit(name)
-    inputs = ", ".join(model.inputs)
-    for values in (dict(parameters), {n: model.nominal[n] for n in parameters}):
-        share, slope, offset = _straight(record, simulate(model, record, values, start), name)
-        if slope < 0:
-            yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
-        elif abs(np.log(slope)) > np.log(1.5) if slope > 0 else False:
-            yield _Trial(share, f"a {name} {slope:.2g} times as large as simulated (its unit, or that of {inputs})")
-        else:
-            yield _Trial(share, f"{name} less {offset:.3g} {unit}".rstrip() + " (Column(..., offset=))")
-        for changed, words in _other_records(model, record):
-            share, slope, _ = _straight(changed, simulate(model, changed, values, start), name)
+    """Yield single changes of sign, unit or offset, with the fitted and with the nominal values."""
+    unit, inputs = model.unit(name), ", ".join(model.inputs)
+    nominal = model.nominal, {p.name: p.value for p in model.initial}
+    for values, initial in ((parameters, start), nominal):
+        if grid_of(model, record).substeps <= _STEPS:
+            share, slope, offset = _straight(record, simulate(model, record, values, initial), name)
+            if slope < 0:
+                yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
+            elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
+                yield _Trial(share, f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})")
+            else:
+                yield _Trial(
+                    share, f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
+                )
+        for changed, words in _other_records(model, record, name):
+            share, slope, _ = _straight(changed, simulate(model, changed, values, initial), name)
             if slope > 0:
                 yield _Trial(share, words)
 
 
-def _other_records(model: Model, record: Record) -> Iterator[tuple[Record, str]]:
-    for name in model.inputs:
-        values = record.inputs[name]
-        yield replace(record, inputs={**record.inputs, name: -values}), f"the opposite sign of {name}"
-        for factor in _DECADES:
-            changed = replace(record, inputs={**record.inputs, name: factor * values})
-            yield changed, f"{factor:g} times {name} (mind the unit of its column)"
+def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Record, str]]:
+    """Yield the record with another unit of time, and with other signs and units of the inputs, unless that is slow."""
     yield replace(record, time=1e-3 * record.time), "a thousandth of the time (is it in ms?)"
+    for given in model.inputs if grid_of(model, record).substeps <= _STEPS else ():
+        values = record.inputs[given]
+        yield replace(record, inputs={**record.inputs, given: -values}), f"the opposite sign of {given}, or of {name},"
+        for factor in _DECADES:
+            changed = replace(record, inputs={**record.inputs, given: factor * values})
+            yield changed, f"{factor:g} times {given} (mind the unit of its column)"
 
 
 def _straight(record: Record, simulated, name: str) -> tuple[float, float, float]:

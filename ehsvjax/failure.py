@@ -1,5 +1,6 @@
 """Simulations that fail: which output stops being finite, when, and what to look at."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -39,6 +40,18 @@ def failure_of(record: Record, simulated: Mapping[str, Float[np.ndarray, " time"
         return None
     sample = min(first.values())
     return Failure(tuple(name for name, k in first.items() if k == sample), sample, float(record.time[sample]))
+
+
+def warn_of_failure(model: Model, record: Record, simulated: Mapping[str, Float[np.ndarray, " time"]]) -> None:
+    """Warn, as Python does, of a simulation that is not finite throughout."""
+    failure = failure_of(record, simulated)
+    if failure is not None:
+        warnings.warn(
+            f"the simulation of {model.name} on {record.name} fails: {failure}; mind the units of its inputs, its "
+            "initial conditions and max_step",
+            RuntimeWarning,
+            stacklevel=3,
+        )
 
 
 def nothing_finite(

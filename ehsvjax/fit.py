@@ -2,7 +2,6 @@
 
 import functools
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -10,8 +9,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.arguments import by_name, instance, number
-from ehsvjax.failure import failure_of
+from ehsvjax.arguments import by_name, instance, number, one_of
+from ehsvjax.failure import warn_of_failure
 from ehsvjax.models.model import Model
 from ehsvjax.record import Record
 from ehsvjax.score import Score, differences, score_of
@@ -154,14 +153,7 @@ class Fit:
 
         """
         simulated = simulate(self.model, record, self.parameters, self.initial_of(record, initial))
-        failure = failure_of(record, simulated)
-        if failure is not None:
-            warnings.warn(
-                f"the simulation of {self.model.name} on {record.name} fails: {failure}; mind the units of its inputs, "
-                "its initial conditions and max_step",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+        warn_of_failure(self.model, record, simulated)
         return simulated
 
     def residuals(
@@ -323,6 +315,7 @@ class Fit:
     def _prepared(self, noise: str) -> "Prepared":
         from ehsvjax.precision import of_fit
 
+        one_of("noise", noise, ("auto", "white", "coloured"))
         if noise not in self._prepared_by_noise:
             self._prepared_by_noise[noise] = of_fit.prepared(self, noise)
         return self._prepared_by_noise[noise]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax.arguments import number, one_of
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
 from ehsvjax.precision.directions import (
@@ -21,7 +22,7 @@ from ehsvjax.precision.directions import (
 )
 from ehsvjax.precision.remedies import unfixed_directions
 from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, absorbed_by_the_fit, meat, residual_noise
-from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, sensitivities
+from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, check_finite, sensitivities
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ def quantile_of(level: float) -> float:
         ValueError: unless the level is between 0 and 1.
 
     """
-    if not 0.0 < level < 1.0:
+    if not 0.0 < number("a confidence level between 0 and 1", level) < 1.0:
         raise ValueError(f"expected a confidence level between 0 and 1, such as 0.95, got {level!r}")
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
@@ -138,12 +139,12 @@ def linearised(
         expected: there are no residuals: the noise is white, of the problem's variance.
 
     Raises:
-        ValueError: for an unknown colour.
+        ValueError: for an unknown colour, or where the simulation or a derivative of it is not finite.
 
     """
-    if colour not in ("auto", "white", "coloured"):
-        raise ValueError(f"expected noise to be 'auto', 'white' or 'coloured', got {colour!r}")
+    one_of("noise", colour, ("auto", "white", "coloured"))
     found = sensitivities(problem, values)
+    check_finite(problem, found)
     noises, factor, curvature, words = None, 1.0, 1.0, "white, of the variance given"
     if not expected:
         noises, factor, curvature, words = _noise(problem, found, noise_variance_given, colour)
