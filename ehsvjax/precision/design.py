@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ehsvjax.arguments import by_name, instance, number, several
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
-from ehsvjax.precision.sensitivities import sensitivities
+from ehsvjax.precision.sensitivities import check_finite, sensitivities
 from ehsvjax.precision.standard_errors import Precision, covariance_of, linearised, precision_of
 from ehsvjax.record import Record
 from ehsvjax.simulate import simulate
@@ -40,11 +41,13 @@ def design(
         ValueError: as `identify` does, and for an output that the model does not have.
 
     """
-    for name in noise_variance:
+    instance("model", model, Model, "take ehsvjax.servovalve(), or write your own")
+    for name in by_name("noise_variance", noise_variance):
         if name not in model.outputs:
             known = ", ".join(model.outputs)
             raise ValueError(f"expected noise_variance of outputs of {model.name}, {known}; got {name!r}")
-    records = (records,) if isinstance(records, Record) else tuple(records)
+    records = several("records", records, Record, "make one with Record(time, inputs)")
+    _check_values(model, parameters, initial_values)
     expected = []
     for record in records:
         simulated = simulate(model, record, parameters, initial_values)
@@ -84,12 +87,28 @@ def cramer_rao_bound(
         ValueError: as `identify` does.
 
     """
-    records = (records,) if isinstance(records, Record) else tuple(records)
+    instance("model", model, Model, "take ehsvjax.servovalve(), or write your own")
+    records = several("records", records, Record, "make one with Record.from_csv")
+    _check_values(model, parameters, initial_values)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance)
     found = sensitivities(problem, _point(model, problem, parameters, initial_values))
+    check_finite(problem, found)
     covariance, seen = covariance_of(found, None, 1.0)
     deviations = np.where(seen, np.sqrt(np.diagonal(covariance)) * found.scale, np.inf)
     return {name: float(deviation) for name, deviation in zip(problem.free, deviations, strict=False)}
+
+
+def _check_values(model: Model, parameters, initial_values) -> None:
+    there = {
+        "parameters": tuple(p.name for p in model.parameters),
+        "initial_values": tuple(p.name for p in model.initial),
+    }
+    for words, values in (("parameters", parameters), ("initial_values", initial_values)):
+        for name, value in by_name(words, values).items():
+            if name not in there[words]:
+                known = ", ".join(there[words]) or "none"
+                raise ValueError(f"expected {words} of {model.name}, {known}; got {name!r}")
+            number(name, value)
 
 
 def _point(model: Model, problem: Problem, parameters, initial_values) -> np.ndarray:

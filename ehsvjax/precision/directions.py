@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities
 
@@ -119,14 +119,17 @@ def taking_part(unfixed: Float[np.ndarray, "parameter direction"]) -> np.ndarray
     return np.linalg.norm(unfixed, axis=1) > _TAKES_PART
 
 
-def combinations(found: Sensitivities, fixed: Spectrum) -> tuple[Combination, ...]:
-    """Return what is fixed of each parameter that is not, but for as many as there are directions.
+def combinations(
+    found: Sensitivities, fixed: Spectrum, not_fixed: Bool[np.ndarray, " parameter"]
+) -> tuple[Combination, ...]:
+    """Return what is fixed of each parameter that itself is `not_fixed`, but for as many as there are directions.
 
     The parameters left over are those by which the others are multiplied or divided, chosen so that the largest error
     of a combination is least. Relative changes combine as products of powers, others as sums.
     """
     unfixed = fixed.unfixed
-    tied = np.flatnonzero(taking_part(unfixed))
+    # One that has a standard error of its own needs no other.
+    tied = np.flatnonzero(taking_part(unfixed) & not_fixed)
     count = unfixed.shape[1]
     if count == 0 or len(tied) <= count:
         return ()

@@ -14,6 +14,8 @@ from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, sensitiviti
 _AMPLITUDES = (0.1, 0.3, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 # A direction counts as fixed by another amplitude once it is known to this share.
 _WELL_FIXED = 0.2
+# Times its length to which a record can be meant to be prolonged.
+_LONGEST = 1000.0
 
 
 def unfixed_directions(problem: Problem, found: Sensitivities, here: Spectrum) -> tuple[Direction, ...]:
@@ -100,5 +102,9 @@ def _remedy(problem: Problem, here: Spectrum, others: Mapping[float, Spectrum], 
             )
     if np.isfinite(here.along(vector)):
         times = (here.along(vector) / _WELL_FIXED) ** 2
+        if times > _LONGEST:
+            return (
+                "this record hardly shows it, nor would another amplitude or length; fix it, or measure another output"
+            )
         return f"this record hardly shows it, nor would another amplitude; {times:.2g} times its length would, to 20%"
     return "neither this record nor another amplitude shows it; fix it, or measure another output"

@@ -89,8 +89,8 @@ def check_finite(problem: Problem, found: Sensitivities) -> None:
     where = f"at sample {sample} of record {record}, {after:.6g} s after its start"
     if not np.isfinite(found.simulated[tuple(row)]):
         raise ValueError(
-            f"expected a simulation that stays finite, got none of {output} {where}: mind units, initial conditions and "
-            "max_step"
+            f"expected a simulation that stays finite, got none of {output} {where}: mind units, initial conditions "
+            "and max_step"
         )
     names = [*problem.free, *problem.free_initial * len(problem.samples.inputs)]
     unknown = names[int(np.argmin(np.isfinite(found.jacobian[tuple(row)])))]

@@ -245,14 +245,22 @@ def _sentence(problem: Problem, noises: list[ResidualNoise], colour: str, source
         else:
             why = f"the residuals look white ({test})"
         return f"white, {source}: {why}"
-    period = float(np.max(problem.samples.sample_period))
+    period, samples = float(np.max(problem.samples.sample_period)), int(np.sum(problem.samples.measured))
     each = ", ".join(
-        f"{name}: autoregression of order {len(n.coefficients)}, {n.correlation_samples:.3g} samples "
-        f"({1e3 * period * n.correlation_samples:.3g} ms) tell as much as one"
-        for name, n in coloured
+        f"{name}: autoregression of order {len(n.coefficients)}, {_worth(n, period, samples)}" for name, n in coloured
     )
     why = "asked for" if colour == "coloured" else f"the residuals are correlated ({test})"
     return f"coloured, {source}: {why}; {each}"
+
+
+def _worth(noise: ResidualNoise, period: float, samples: int) -> str:
+    """Say how much samples with noise of that colour tell of a constant."""
+    together = noise.correlation_samples
+    if not together < samples:
+        return f"which all {samples} samples together do not average out"
+    if together < 1.0:
+        return f"whose swings cancel: of a constant one sample tells as much as {1.0 / together:.3g} with white noise"
+    return f"{together:.3g} samples ({1e3 * period * together:.3g} ms) tell as much as one"
 
 
 def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
@@ -278,7 +286,7 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
             (names[i], names[j]): float(correlation[i, j]) for i in range(count) for j in range(i) if both[i, j]
         },
         covariance=np.where(both, parameters, np.nan),
-        combinations=combinations(found, directions),
+        combinations=combinations(found, directions, ~fixed[:count]),
         unfixed=unfixed_directions(problem, found, directions),
         initial_errors=tuple(
             {name: float(e) for name, e in zip(problem.free_initial, row, strict=True)} for row in by_record
