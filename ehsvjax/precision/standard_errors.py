@@ -16,6 +16,7 @@ from ehsvjax.precision.directions import (
     Direction,
     Spectrum,
     combinations,
+    of_covariance,
     parameter_root,
     spectrum,
     taking_part,
@@ -268,6 +269,9 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
     found, noises, factor, _, words, covariance, seen = fit
     directions = spectrum(parameter_root(found) / np.sqrt(factor))
     count, names = len(found.names), list(found.names)
+    coloured = noises is not None and any(len(noise.coefficients) for noise in noises)
+    if coloured:
+        directions = of_covariance(directions, covariance[:count, :count])
     deviation = np.sqrt(np.diagonal(covariance))
     fixed = seen & (deviation <= NOT_FIXED)
     fixed[:count] &= ~taking_part_strongly(directions)
@@ -292,7 +296,7 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
             {name: float(e) for name, e in zip(problem.free_initial, row, strict=True)} for row in by_record
         ),
         noise=words,
-        coloured=noises is not None and any(len(noise.coefficients) for noise in noises),
+        coloured=coloured,
         logarithmic=tuple(name for name in names if model.parameter(name).scale == "log"),
     )
 
