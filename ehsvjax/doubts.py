@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ehsvjax.fit import Effort, Fit, at_bound
+from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit, at_bound
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem, cast, residuals
 from ehsvjax.record import Record
@@ -80,7 +80,7 @@ def _about_outputs(fit: Fit, residual_variance: Mapping[str, float]) -> tuple[st
         if share < _NOTHING and (left > _NOISE * noise or share < -_NOTHING):
             record, start = max(holding, key=lambda pair: np.nanvar(pair[0].outputs[name]))
             found.append(
-                f"the model explains nothing of {name}: {_fit(share)}, where its mean alone has 0 %; "
+                f"{EXPLAINS_NOTHING} {name}: {_fit(share)}, where its mean alone has 0 %; "
                 + _what_would(fit.model, record, fit.parameters, start, name)
             )
     return tuple(found)
@@ -156,7 +156,7 @@ def _variance(readings: Sequence[Float[np.ndarray, " time"]], robust: bool) -> f
 
 
 def _fit(share: float) -> str:
-    percent = 100.0 * (1.0 - (1.0 - share) ** 0.5)
+    percent = 100.0 * (1.0 - max(1.0 - share, 0.0) ** 0.5)
     return "fit below -1000 %" if percent < -1000.0 else f"fit {percent:.{0 if abs(percent) >= 10.0 else 2}f} %"
 
 

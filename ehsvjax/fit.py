@@ -42,6 +42,10 @@ class History(NamedTuple):
     best: dict[str, Float[np.ndarray, " generation"]]
 
 
+EXPLAINS_NOTHING = "the model explains nothing of"
+"""How the warning begins that comes before everything else."""
+
+
 def at_bound(name: str, side: str, what: str = "") -> str:
     """Return the warning of a fit whose parameter is at its "lower" or "upper" bound."""
     return f"{name} is at its {side} bound{what}: widen bounds={{{name!r}: ...}} or fix it"

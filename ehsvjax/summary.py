@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.fit import Effort, Fit
+from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.precision.directions import Direction
 from ehsvjax.precision.standard_errors import Precision
@@ -55,8 +55,6 @@ _PARAMETER_HEAD = ("name", "symbol", "value", "standard error", "unit", "bounds"
 _LARGE = 0.1
 # Per cent beyond which a figure says no more than that.
 _ABSURD = 1000.0
-# Fit, in per cent, from which on an output counts as explained (`doubts`): a tenth of its variance.
-_EXPLAINS_NOTHING = 100.0 * (1.0 - 0.9**0.5)
 NOT_FINITE = "not finite"
 # Correlations that are printed, as in lmfit's reports.
 _LEAST_CORRELATION = 0.5
@@ -64,8 +62,8 @@ _RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
 
 
 def _sections(fit: Fit) -> Iterator[_Section]:
-    # Warnings come last, unless they are what matters: of a model that explains an output worse than its mean does.
-    first = bool(fit.warnings) and min(fit.fit_percent.values()) < _EXPLAINS_NOTHING
+    # Warnings come last, unless they are all that matters.
+    first = any(warning.startswith(EXPLAINS_NOTHING) for warning in fit.warnings)
     if first:
         yield _warnings(fit)
     yield _Section("Model", _model_rows(fit.model))
