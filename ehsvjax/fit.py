@@ -205,7 +205,7 @@ class Fit:
         """
         checked_record(record)
         nominal = {p.name: p.value for p in self.model.initial}
-        if not isinstance(initial, str):
+        if isinstance(initial, Mapping):
             given = by_name("initial conditions", initial)
             for name in given:
                 if name not in nominal:
@@ -214,10 +214,10 @@ class Fit:
                         f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}"
                     )
             return nominal | {name: number(name, value) for name, value in given.items()}
+        if initial not in ("estimate", "nominal"):
+            raise ValueError(f"expected initial 'estimate', 'nominal' or values by name, got {initial!r}")
         if initial == "nominal":
             return nominal
-        if initial != "estimate":
-            raise ValueError(f"expected initial 'estimate', 'nominal' or values by name, got {initial!r}")
         for fitted, values in zip(self.records, self.initial, strict=True):
             if fitted is record:
                 return values

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.fit import Fit
+from ehsvjax.fit import Fit, checked_record
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.record import Record
@@ -58,7 +58,7 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
         ValueError: if the record lacks an input, or holds no output.
 
     """
-    if not record.outputs:
+    if not checked_record(record).outputs:
         raise ValueError(f"expected {record.name} to hold an output to draw, got none: use fit.simulate(record)")
     initial = fit.initial_of(record)
     simulated, score = fit.simulate(record, initial), fit.score(record, initial)

@@ -174,9 +174,9 @@ def _choices(unfixed: Float[np.ndarray, "parameter direction"], tied: np.ndarray
 
 
 def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Combination:
-    """Return the combination as a product of powers or as a sum, whichever has round powers or factors.
+    """Return the combination as a product of powers or as a sum, whichever has the plainer powers or factors.
 
-    To first order both say the same; where neither is round it is a product of relative changes, otherwise a sum.
+    To first order both say the same; where neither is plainer it is a product of relative changes, otherwise a sum.
     """
     taking = [i for i in _largest_first(vector) if abs(vector[i]) > _TAKES_PART]
     names, first = [found.names[i] for i in taking], taking[0]
@@ -189,7 +189,8 @@ def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Comb
     defined = all(
         value > 0 or (value < 0 and powers[name].is_integer()) for name, value in zip(names, values, strict=True)
     )
-    if defined and (_all_round(powers) or (found.relative[taking].all() and not _all_round(factors))):
+    plainer = _denominators(factors) - _denominators(powers)
+    if defined and (plainer > 0 or (plainer == 0 and found.relative[taking].all())):
         product = float(np.prod([value ** powers[name] for name, value in zip(names, values, strict=True)]))
         return Combination(_product(powers), powers, product, float(abs(product * unit) * error))
     # A sum, in the unit of the first.
@@ -197,8 +198,11 @@ def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Comb
     return Combination(_sum(factors), factors, total, float(scale[0] * error / abs(weights[0])))
 
 
-def _all_round(numbers: dict[str, float]) -> bool:
-    return all(abs(float(Fraction(number).limit_denominator(4)) - number) < 1e-3 for number in numbers.values())
+def _denominators(numbers: dict[str, float]) -> int:
+    """Return how far from plain numbers are: the sum of their denominators, those that are no simple fraction apart."""
+    near = [Fraction(number).limit_denominator(4) for number in numbers.values()]
+    plain = all(abs(float(f) - number) < 1e-3 for f, number in zip(near, numbers.values(), strict=True))
+    return sum(f.denominator for f in near) if plain else 5 * len(near)
 
 
 def _rounded(power: float) -> float:

@@ -87,6 +87,10 @@ class Precision:
     __repr__ = __str__
 
 
+# Of the noise's variance, in the problem's.
+_LEAST_FACTOR = 1e-100
+
+
 def quantile_of(level: float) -> float:
     """Return the normal quantile of a two-sided interval.
 
@@ -267,7 +271,8 @@ def _worth(noise: ResidualNoise, period: float, samples: int) -> str:
 def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
     """Return what a person wants to know of a fit to first order."""
     found, noises, factor, _, words, covariance, seen = fit
-    directions = spectrum(parameter_root(found) / np.sqrt(factor))
+    # Data without any noise leave no residuals, and all directions that show are fixed.
+    directions = spectrum(parameter_root(found) / np.sqrt(max(factor, _LEAST_FACTOR)))
     count, names = len(found.names), list(found.names)
     coloured = noises is not None and any(len(noise.coefficients) for noise in noises)
     if coloured:
