@@ -16,7 +16,7 @@ Initial = str | Mapping[str, float] | Sequence[Mapping[str, float]]
 # First readings that tell where an initial condition lies; how far beyond them it may lie, in ranges of the output and
 # in standard deviations of its noise.
 _FIRST = 5
-_REACH_OF_RANGE, _REACH_OF_NOISE = 0.1, 5.0
+_REACH_OF_RANGE, _REACH_OF_NOISE = 0.1, 3.0
 
 
 def problem_of(
@@ -128,7 +128,7 @@ def _first_shown(parameter: Parameter, record: Record) -> _Shown | None:
 
     From the least to the largest of the first readings, as a signal may turn at once and a reading may be a spike; by
     their steepest step farther for every sample that is missing before them; and give or take a tenth of the output's
-    range and five times its noise.
+    range and three times its noise.
     """
     output = record.outputs.get(parameter.output) if parameter.output else None
     if output is None:
