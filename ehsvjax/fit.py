@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.arguments import by_name, instance, number, one_of
+from ehsvjax.failure import warn_of_failure
 from ehsvjax.models.model import Model
 from ehsvjax.record import Record
+from ehsvjax.score import Score, differences, score_of
 from ehsvjax.simulate import simulate
 
 if TYPE_CHECKING:
@@ -18,21 +21,6 @@ if TYPE_CHECKING:
 
     from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
     from ehsvjax.precision.of_fit import Prepared
-
-
-class Score(NamedTuple):
-    """How well outputs are reproduced, by name of the output.
-
-    Attributes:
-        rmse: root of the mean squared error, in the output's unit.
-        fit_percent: 100*(1 - ||y - ym|| / ||y - mean(y)||), MATLAB's fit: 100 is perfect, 0 no better than the mean.
-        cost: equation (9) of the paper, the integral of the squared error, in the output's unit squared times s.
-
-    """
-
-    rmse: dict[str, float]
-    fit_percent: dict[str, float]
-    cost: dict[str, float]
 
 
 class History(NamedTuple):
@@ -52,6 +40,10 @@ class History(NamedTuple):
     failed: Float[np.ndarray, " generation"]
     spread: Float[np.ndarray, " generation"]
     best: dict[str, Float[np.ndarray, " generation"]]
+
+
+EXPLAINS_NOTHING = "the model explains nothing of"
+"""How the warning begins that comes before everything else."""
 
 
 def at_bound(name: str, side: str, what: str = "") -> str:
@@ -163,35 +155,50 @@ class Fit:
                 record of the fit), or taken as "nominal", or given by name.
 
         Returns:
-            every output of the model by name, `[time]`, SI.
+            every output of the model by name, `[time]`, SI; a `RuntimeWarning` says where it is not finite.
 
         Raises:
-            ValueError: if the record lacks an input, or has no output to estimate initial conditions from.
+            ValueError: for what is no record, one that lacks an input, or one without an output to estimate initial
+                conditions from.
 
         """
-        return simulate(self.model, record, self.parameters, self.initial_of(record, initial))
+        simulated = simulate(self.model, record, self.parameters, self.initial_of(record, initial))
+        warn_of_failure(self.model, record, simulated)
+        return simulated
 
     def residuals(
         self, record: Record | None = None, initial: Mapping[str, float] | str = "estimate"
     ) -> dict[str, Float[np.ndarray, " time"]]:
-        """Measured minus simulated of each output that the record holds, `[time]`, SI; NaN for missing samples.
+        """Measured minus simulated of each output that the record holds, `[time]`, SI.
+
+        NaN for missing readings, +inf for those where the simulation is not finite: no model is good where it fails.
 
         Args:
             record: by default the first that was fitted.
             initial: as for `simulate`.
 
+        Raises:
+            ValueError: as `simulate` does, and for an output that the model does not have.
+
         """
-        record = self.records[0] if record is None else record
+        record = self.records[0] if record is None else checked_record(record)
+        unknown = [name for name in record.outputs if name not in self.model.outputs]
+        if unknown:
+            raise ValueError(
+                f"expected the outputs of {record.name} to be among those of {self.model.name}, "
+                f"{', '.join(self.model.outputs)}; got {', '.join(unknown)}: name its columns accordingly, or drop "
+                "them with .select"
+            )
         simulated = self.simulate(record, initial)
-        return {name: measured - simulated[name] for name, measured in record.outputs.items()}
+        return {name: differences(measured, simulated[name]) for name, measured in record.outputs.items()}
 
     def score(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> Score:
-        """Judge the prediction of one record, fitted or new; arguments as for `simulate`."""
-        return _score([record], [self.residuals(record, initial)])
+        """Judge the prediction of one record, fitted or new; arguments and refusals as for `residuals`."""
+        return score_of([record], [self.residuals(record, initial)])
 
     @functools.cached_property
     def _score(self) -> Score:
-        return _score(self.records, [self.residuals(record) for record in self.records])
+        return score_of(self.records, [self.residuals(record) for record in self.records])
 
     def initial_of(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> dict[str, float]:
         """Return the initial conditions, name -> value, with which `simulate` starts; arguments as there.
@@ -202,17 +209,21 @@ class Fit:
             ValueError: as `simulate` does.
 
         """
-        for name in initial if not isinstance(initial, str) else ():
-            if name not in {p.name for p in self.model.initial}:
-                known = ", ".join(p.name for p in self.model.initial) or "none"
-                raise ValueError(f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}")
+        checked_record(record)
         nominal = {p.name: p.value for p in self.model.initial}
-        if not isinstance(initial, str):
-            return nominal | dict(initial)
+        if isinstance(initial, Mapping):
+            given = by_name("initial conditions", initial)
+            for name in given:
+                if name not in nominal:
+                    known = ", ".join(nominal) or "none"
+                    raise ValueError(
+                        f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}"
+                    )
+            return nominal | {name: number(name, value) for name, value in given.items()}
+        if initial not in ("estimate", "nominal"):
+            raise ValueError(f"expected initial 'estimate', 'nominal' or values by name, got {initial!r}")
         if initial == "nominal":
             return nominal
-        if initial != "estimate":
-            raise ValueError(f"expected initial 'estimate', 'nominal' or values by name, got {initial!r}")
         for fitted, values in zip(self.records, self.initial, strict=True):
             if fitted is record:
                 return values
@@ -314,6 +325,7 @@ class Fit:
     def _prepared(self, noise: str) -> "Prepared":
         from ehsvjax.precision import of_fit
 
+        one_of("noise", noise, ("auto", "white", "coloured"))
         if noise not in self._prepared_by_noise:
             self._prepared_by_noise[noise] = of_fit.prepared(self, noise)
         return self._prepared_by_noise[noise]
@@ -369,15 +381,11 @@ class Fit:
         return load_fit(path, model)
 
 
-def _score(records: Sequence[Record], residuals: Sequence[Mapping[str, Float[np.ndarray, " time"]]]) -> Score:
-    """Return the score of each output over records; a missing sample counts for nothing."""
-    names = dict.fromkeys(name for record in records for name in record.outputs)
-    rmse, fit_percent, cost = {}, {}, {}
-    for name in names:
-        pairs = [(r, e[name]) for r, e in zip(records, residuals, strict=True) if name in r.outputs]
-        errors = np.concatenate([error for _, error in pairs])
-        about_mean = np.concatenate([r.outputs[name] - np.nanmean(r.outputs[name]) for r, _ in pairs])
-        rmse[name] = float(np.sqrt(np.nanmean(errors**2)))
-        fit_percent[name] = float(100.0 * (1.0 - np.sqrt(np.nansum(errors**2) / np.nansum(about_mean**2))))
-        cost[name] = float(sum(np.nansum(error**2) * r.sample_period for r, error in pairs))
-    return Score(rmse, fit_percent, cost)
+def checked_record(record) -> Record:
+    """Return a record.
+
+    Raises:
+        ValueError: for anything else.
+
+    """
+    return instance("record", record, Record, "make one with Record.from_csv")

@@ -2,19 +2,23 @@
 
 import os
 import threading
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Key
 
-from ehsvjax import genetic
-from ehsvjax.arithmetic import arithmetic_at, outputs_of, settled_at
+from ehsvjax import doubts, genetic
+from ehsvjax.arguments import file_path, flag, instance, not_negative, several, whole_number
+from ehsvjax.arithmetic import arithmetic_at, settled_at
 from ehsvjax.draws import check_key
-from ehsvjax.fit import Effort, Fit, History, at_bound
+from ehsvjax.failure import nothing_finite
+from ehsvjax.fit import Effort, Fit, History
 from ehsvjax.genetic import Operators
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem, cast, population_cost, shared_cost, to_unit, to_values
@@ -22,7 +26,7 @@ from ehsvjax.record import Record
 from ehsvjax.refine import Refined
 from ehsvjax.refine import refine as refine_starts
 from ehsvjax.search import search
-from ehsvjax.unknowns import Initial, problem_of
+from ehsvjax.unknowns import Initial, problem_of, where_to_search
 
 DEFAULT_OPERATORS = Operators()
 # Of refinement, at most, until the weights of the outputs, the step and the readings that are known no longer change.
@@ -84,20 +88,26 @@ def identify(
         the fit: print it, plot it, simulate with it.
 
     Raises:
-        ValueError: for anything that cannot be meant, before a simulation is run.
+        ValueError: for anything that cannot be meant, before a simulation is run; and if every simulation fails, with
+            what fails first and what to look at.
 
     """
-    records = (records,) if isinstance(records, Record) else tuple(records)
-    _check_call(records, key, starts, tolerance)
+    records = several("records", records, Record, "make one with Record.from_csv")
+    _check_call(model, key, operators, tolerance, checkpoint, refine=refine, progress=progress)
+    _check_sizes(population=(population, 4), generations=(generations, 1), starts=(starts, 1), islands=(islands, 1))
     devices = None if devices is None else _checked_devices(devices)
     cost = population_cost if devices is None or islands > 1 else shared_cost(devices)
     model = model.with_bounds(bounds, fixed)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
+    begin = replace(problem, coordinates=where_to_search(model, records, problem))
+    slow = doubts.about_steps(model, records)
+    for doubt in slow:
+        warnings.warn(doubt, RuntimeWarning, stacklevel=2)
 
     compiling = _compile_refinement(problem, starts, population) if refine else None
     found, history = search(
         # A number of steps that is compiled in is a tenth faster.
-        Partial(cost, cast(replace(problem, substeps=None), jnp.float32)),
+        Partial(cost, cast(replace(begin, substeps=None), jnp.float32)),
         key,
         unknowns=problem.unknowns,
         population=population,
@@ -110,17 +120,40 @@ def identify(
         checkpoint=checkpoint,
     )
     effort = _search_effort(found, generations)
-    individual = np.asarray(found.elites, np.float64)[0]
-    problem = settled_at(problem, individual)
-    if compiling is not None:
+    reweigh = noise_variance is None
+    problem = settled_at(problem, _within_bounds(begin, problem, np.asarray(found.elites, np.float64)[0]))
+    if compiling is None:
+        best = _as_searched(begin, problem, found, effort, reweigh=reweigh)
+    else:
         compiling.join()
-        candidates = _candidates(problem, model, found, starts)
-        refined, agreeing, problem = _refine_and_reweigh(problem, candidates, reweigh=noise_variance is None)
-        individual, effort = _best_of(refined, agreeing, effort)
-    elif noise_variance is None:
-        problem = replace(problem, noise_variance=_residual_variance(problem, _residuals_of(problem, individual)))
-        problem = settled_at(problem, individual)
-    return _fit(model, records, problem, individual, history, effort, noise_variance is not None)
+        starting = _within_bounds(begin, problem, _candidates(begin, model, found, starts))
+        best = _best_of(*_refine_and_reweigh(problem, starting, reweigh=reweigh), effort, reweighed=reweigh)
+    if not np.isfinite(best.cost):
+        raise ValueError(nothing_finite(model, records, _nominal_initial(begin, model), effort.simulations))
+    fit = _fit(model, records, best, history, not reweigh)
+    about = doubts.about_fit(fit, best.problem, best.individual, best.residual_variance, best.idle)
+    return replace(fit, warnings=(*slow, *about))
+
+
+class _Best(NamedTuple):
+    """Where search and refinement ended.
+
+    Attributes:
+        problem: with the outputs weighted as in the end.
+        individual: in the unit cube.
+        cost: of it; +inf where nothing could be simulated.
+        residual_variance: `[signal]` mean square of each output's residuals, unit squared.
+        idle: `[parameter]` which unknowns change nothing near it, as far as is known.
+        effort: what was done.
+
+    """
+
+    problem: Problem
+    individual: Float[np.ndarray, " parameter"]
+    cost: float
+    residual_variance: Float[np.ndarray, " signal"]
+    idle: Bool[np.ndarray, " parameter"]
+    effort: Effort
 
 
 def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
@@ -148,27 +181,40 @@ def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
     }
     if len(given) == len(first):
         return given
+    if not variance:
+        raise ValueError(
+            f"expected {record.name} to hold an output that was fitted, {', '.join(fit.outputs)}, to estimate its "
+            f'initial conditions from; it has {", ".join(record.outputs)}: pass initial="nominal" or their values by '
+            "name"
+        )
+    record = record.select(outputs=list(variance))
     problem = problem_of(known, [record], initial=given, noise_variance=variance, huber=fit.huber)
+    begin = replace(problem, coordinates=where_to_search(known, [record], problem))
     middle = np.full(problem.unknowns, 0.5)
-    starts = np.stack([middle, _with_nominal_initial(problem, known, middle)])
+    starts = _within_bounds(begin, problem, np.stack([middle, _with_nominal_initial(begin, known, middle)]))
     refined, _, problem = _refine_and_reweigh(problem, starts, reweigh=False)
     best = refined.individual[int(np.argmin(refined.cost))]
     return _initial_by_record(known, problem, best)[0]
 
 
-def _check_call(records, key, starts, tolerance):
-    if not records or not all(isinstance(record, Record) for record in records):
-        kinds = ", ".join(sorted({type(r).__name__ for r in records})) or "none"
-        raise ValueError(f"expected a Record or a sequence of Records, got {kinds}: make one with Record.from_csv")
+def _check_call(model, key, operators, tolerance, checkpoint, **flags):
+    instance("model", model, Model, "take ehsvjax.servovalve(), or write your own")
     check_key(key)
-    if isinstance(starts, bool) or not isinstance(starts, int) or starts < 1:
-        raise ValueError(f"expected starts to be a whole number of at least 1, got {starts!r}")
-    if not tolerance >= 0:
-        raise ValueError(f"expected tolerance to be zero or more noise variances, got {tolerance!r}")
+    instance("operators", operators, Operators, "take ehsvjax.Operators(...)")
+    not_negative("tolerance to be zero or more noise variances", tolerance)
+    if checkpoint is not None:
+        file_path("checkpoint", checkpoint)
+    for name, value in flags.items():
+        flag(name, value)
+
+
+def _check_sizes(**sizes):
+    for name, (value, least) in sizes.items():
+        whole_number(name, value, least)
 
 
 def _checked_devices(devices) -> tuple[jax.Device, ...]:
-    devices = tuple(devices)
+    devices = tuple(devices) if isinstance(devices, Sequence | np.ndarray) else (devices,)
     if not devices or not all(isinstance(device, jax.Device) for device in devices):
         raise ValueError(f"expected devices such as jax.devices(), got {devices}")
     return devices
@@ -267,11 +313,6 @@ def _in_numpy(refined: Refined) -> Refined:
     return jax.tree.map(np.array, refined)
 
 
-def _residuals_of(problem: Problem, individual) -> Float[np.ndarray, "record time signal"]:
-    difference = (problem.samples.outputs - outputs_of(problem, individual)) / np.sqrt(problem.noise_variance)
-    return np.where(problem.samples.measured, difference, 0.0)
-
-
 def _residual_variance(
     problem: Problem, standardised: Float[np.ndarray, "record time signal"]
 ) -> Float[np.ndarray, " signal"]:
@@ -288,9 +329,19 @@ def _residual_variance(
     return np.array(variances)
 
 
-def _best_of(refined: Refined, agreeing: int, effort: Effort) -> tuple[Float[np.ndarray, " parameter"], Effort]:
+def _as_searched(begin: Problem, problem: Problem, found: genetic.State, effort: Effort, *, reweigh: bool) -> _Best:
+    """Return the best individual of the search as it is."""
+    individual = _within_bounds(begin, problem, np.asarray(found.elites, np.float64)[0])
+    standardised = doubts.residuals_at(problem, individual)
+    variance = _residual_variance(problem, standardised)
+    cost = float(np.sum(standardised**2))
+    problem = settled_at(replace(problem, noise_variance=variance) if reweigh else problem, individual)
+    return _Best(problem, individual, cost, variance, np.ones(problem.unknowns, bool), effort)
+
+
+def _best_of(refined: Refined, agreeing: int, problem: Problem, effort: Effort, *, reweighed: bool) -> _Best:
     best = int(np.argmin(refined.cost))
-    return np.asarray(refined.individual[best]), effort._replace(
+    effort = effort._replace(
         refined=True,
         iterations=int(refined.iterations[best]),
         starts=len(refined.cost),
@@ -298,11 +349,14 @@ def _best_of(refined: Refined, agreeing: int, effort: Effort) -> tuple[Float[np.
         converged=bool(refined.converged[best]),
         remaining=float(refined.remaining[best]),
     )
+    # Outputs that were weighed by their residuals have the variance of these already.
+    variance = problem.noise_variance if reweighed else _residual_variance(problem, refined.residuals[best])
+    idle = np.diagonal(refined.information[best]) < doubts.NO_CHANGE
+    return _Best(problem, np.asarray(refined.individual[best]), float(refined.cost[best]), variance, idle, effort)
 
 
-def _fit(
-    model, records, problem: Problem, individual, history: genetic.History, effort: Effort, noise_variance_given: bool
-) -> Fit:
+def _fit(model, records, best: _Best, history: genetic.History, noise_variance_given: bool) -> Fit:
+    problem, individual, effort = best.problem, best.individual, best.effort
     values = _values(problem, individual)
     step = float(np.min(problem.samples.sample_period)) / int(problem.substeps)
     effort = effort._replace(
@@ -320,7 +374,7 @@ def _fit(
         noise_variance={name: float(v) for name, v in zip(problem.observed, problem.noise_variance, strict=True)},
         history=_history_in_units(problem, history, effort.generations),
         effort=effort,
-        warnings=_warnings(model, problem, individual, effort),
+        warnings=(),
         huber=problem.huber,
         estimated_initial=problem.free_initial,
         noise_variance_given=noise_variance_given,
@@ -329,6 +383,11 @@ def _fit(
 
 def _readings(records: Sequence[Record]) -> int:
     return sum(int(np.isfinite(series).sum()) for record in records for series in record.outputs.values())
+
+
+def _within_bounds(begin: Problem, problem: Problem, individuals) -> Float[np.ndarray, "*batch parameter"]:
+    """Return individuals of where the search began as ones between the problem's own bounds."""
+    return np.clip(to_unit(problem.coordinates, _values(begin, individuals)), 0.0, 1.0)
 
 
 def _values(problem: Problem, individual) -> Float[np.ndarray, " *batch parameter"]:
@@ -349,26 +408,6 @@ def _history_in_units(problem: Problem, history: genetic.History, generations: i
     return History(best_cost, median_cost, failed, spread, by_name)
 
 
-def _warnings(model: Model, problem: Problem, individual, effort: Effort) -> tuple[str, ...]:
-    """Return what a user should know before trusting the numbers, each with what to do."""
-    found = []
-    names = [*problem.free, *(n for _ in range(len(problem.samples.inputs)) for n in problem.free_initial)]
-    for name, place in zip(names, individual, strict=True):
-        if min(place, 1.0 - place) < 1e-6:
-            side = "lower" if place < 0.5 else "upper"
-            what = "" if name in problem.free else " (an initial condition, which this record may hardly show)"
-            found.append(at_bound(name, side, what))
-    if not effort.refined:
-        found.append("not refined: the parameters are as good as the search left them; use refine=True")
-    elif not effort.converged:
-        found.append(
-            "the refinement has not converged: a further step would lower the sum of squares by "
-            f"{effort.remaining:.2g} noise variances; perhaps the record does not fix every parameter"
-        )
-    if effort.refined and effort.starts > 1 and effort.starts_agreeing == 1:
-        found.append(
-            f"only one of {effort.starts} starts led to this minimum, there may be a better one: use a larger "
-            "population or more generations"
-        )
-    del model
-    return tuple(found)
+def _nominal_initial(problem: Problem, model: Model) -> list[dict[str, float]]:
+    """Return for each record the initial conditions that are known, shown by an output, or nominal."""
+    return _initial_by_record(model, problem, _with_nominal_initial(problem, model, np.full(problem.unknowns, 0.5)))

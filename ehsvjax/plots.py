@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.fit import Fit
+from ehsvjax.fit import Fit, checked_record
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.record import Record
+from ehsvjax.summary import NOT_FINITE, percent_of_fit
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -57,7 +58,7 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
         ValueError: if the record lacks an input, or holds no output.
 
     """
-    if not record.outputs:
+    if not checked_record(record).outputs:
         raise ValueError(f"expected {record.name} to hold an output to draw, got none: use fit.simulate(record)")
     initial = fit.initial_of(record)
     simulated, score = fit.simulate(record, initial), fit.score(record, initial)
@@ -65,12 +66,14 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     count = len(record.outputs)
     with _style():
         figure = _figure(width=9.0, height=3.4 * count + 2.2)
-        figure.suptitle(f"{fit.model.name}: {record.name}", x=0.01, ha="left", fontweight="bold")
+        figure.suptitle(_plain(f"{fit.model.name}: {record.name}"), x=0.01, ha="left", fontweight="bold")
         *signals, search = figure.subplots(2 * count + 1, 1, height_ratios=[2.2, 1.2] * count + [2.2])
         for i, (name, measured) in enumerate(record.outputs.items()):
             unit = fit.model.unit(name)
             axes, below = signals[2 * i : 2 * i + 2]
-            axes.set_title(f"fit {score.fit_percent[name]:.2f} %, rmse {_quantity(score.rmse[name], unit)}")
+            axes.set_title(
+                _plain(f"fit {percent_of_fit(score.fit_percent[name])}, rmse {_quantity(score.rmse[name], unit)}")
+            )
             _draw_series(axes, record.time, {"measured": measured, "model": simulated[name]}, name, unit)
             _draw_residual(below, record.time, measured - simulated[name], unit, bands.get(name))
         _share_time(signals, record)
@@ -135,8 +138,8 @@ def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
             axes.set_yticks([-quantile, 0.0, quantile], [f"−{quantile:.2f}", "0", f"{quantile:.2f}"])
             inside = [v for v, r in zip(profile.values, profile.signed_root, strict=True) if abs(r) < 2 * quantile]
             low, high = min(*inside, profile.interval[0]), max(*inside, profile.interval[1])
-            axes.set(title=_words(name), xlabel=f"{prefix}{unit}" if unit else "", ylim=(-2 * quantile, 2 * quantile),
-                     xlim=(low / factor, high / factor))  # fmt: skip
+            axes.set(title=_words(name), xlabel=_plain(f"{prefix}{unit}") if unit else "",
+                     xlim=(low / factor, high / factor), ylim=(-2 * quantile, 2 * quantile))  # fmt: skip
             axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4), useOffset=False)
             axes.xaxis.get_major_locator().set_params(nbins=4)
         for axes in every[len(names) :]:
@@ -210,7 +213,7 @@ def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
     factor, label = _scaled(record.inputs[command], fit.model.unit(command))
     style = "steps-post" if record.hold == "zero" else "default"
     command_axes.plot(record.time, record.inputs[command] / factor, color=_COMMAND, drawstyle=style)
-    command_axes.set(ylabel=f"{_words(command)}\n{label}", title=record.name)
+    command_axes.set(ylabel=f"{_words(command)}\n{label}", title=_plain(record.name))
 
     series = {"measured": measured, "model": simulated}
     if name in true:
@@ -232,8 +235,9 @@ def _draw_series(axes, time, series: Mapping[str, Any], name: str, unit: str) ->
     }
     factor, label = _scaled(np.concatenate(list(series.values())), unit)
     for kind, values in series.items():
-        missing = int(np.isnan(values).sum())
-        axes.plot(time, values / factor, label=f"{kind} ({missing} missing)" if missing else kind, **looks[kind])
+        absent = int(np.sum(~np.isfinite(values)))
+        why = "missing" if kind == "measured" else NOT_FINITE
+        axes.plot(time, values / factor, label=f"{kind} ({absent} {why})" if absent else kind, **looks[kind])
     axes.set_ylabel(f"{_words(name)}\n{label}")
     _legend(axes)
 
@@ -253,9 +257,11 @@ def _draw_residual(axes, time, residual, unit: str, band: "Band | None" = None) 
 
 def _draw_search(axes, fit: Fit) -> None:
     generations = np.arange(1, len(fit.history.best_cost) + 1)
-    median = np.where(np.isfinite(fit.history.median_cost), fit.history.median_cost, np.nan)
+    median, best = (
+        np.where(np.isfinite(cost), cost, np.nan) for cost in (fit.history.median_cost, fit.history.best_cost)
+    )
     axes.semilogy(generations, median, color=_MEASURED, marker=".", label="median of the generation")
-    axes.semilogy(generations, fit.history.best_cost, color=_MODEL, marker=".", label="best so far")
+    axes.semilogy(generations, best, color=_MODEL, marker=".", label="best so far")
     axes.set(xlabel="generation", ylabel="cost\n(noise variances)", title="genetic search")
     axes.xaxis.get_major_locator().set_params(integer=True)
     _legend(axes)
@@ -277,16 +283,23 @@ def _share_time(axes, record: Record) -> None:
 
 def _scaled(values, unit: str) -> tuple[float, str]:
     """Return what to divide by, and the unit as it then reads in a label: metres of a few thousandths are in mm."""
-    largest = float(np.nanmax(np.abs(values)))
-    prefix = _prefix(largest, unit)
-    return _PREFIXES[prefix], f"({prefix}{unit})" if unit else "(–)"
+    finite = np.abs(values[np.isfinite(values)])
+    prefix = _prefix(float(np.max(finite, initial=0.0)), unit)
+    return _PREFIXES[prefix], _plain(f"({prefix}{unit})") if unit else "(–)"
 
 
 def _words(name: str) -> str:
-    return name.replace("_", " ")
+    return _plain(name.replace("_", " "))
+
+
+def _plain(text: str) -> str:
+    """Return a user's text as matplotlib draws it letter by letter, on one line: a dollar would begin a formula."""
+    return " ".join(text.splitlines()).replace("$", r"\$")
 
 
 def _quantity(value: float, unit: str) -> str:
+    if not math.isfinite(value):
+        return NOT_FINITE
     prefix = _prefix(value, unit)
     return f"{value / _PREFIXES[prefix]:.3g} {prefix}{unit}".rstrip()
 

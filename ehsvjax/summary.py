@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.fit import Effort, Fit
+from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.precision.directions import Direction
 from ehsvjax.precision.standard_errors import Precision
@@ -53,23 +53,46 @@ _OUTPUT_HEAD = ("output", "rmse", "fit", "noise standard deviation")
 _PARAMETER_HEAD = ("name", "symbol", "value", "standard error", "unit", "bounds")
 # Share of its value from which an error is large.
 _LARGE = 0.1
+# Per cent beyond which a figure says no more than that.
+_ABSURD = 1000.0
+NOT_FINITE = "not finite"
 # Correlations that are printed, as in lmfit's reports.
 _LEAST_CORRELATION = 0.5
 _RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
 
 
 def _sections(fit: Fit) -> Iterator[_Section]:
+    # Warnings come last, unless they are all that matters.
+    first = any(warning.startswith(EXPLAINS_NOTHING) for warning in fit.warnings)
+    if first:
+        yield _warnings(fit)
     yield _Section("Model", _model_rows(fit.model))
     title = "Record" if len(fit.records) == 1 else "Records"
     yield _Section(title, [_record_row(record) for record in fit.records], _RECORD_HEAD)
     yield _Section("Fit statistics", _statistics_rows(fit))
     yield _Section("Outputs", _output_rows(fit), _OUTPUT_HEAD)
-    precision = fit.precision()
+    precision = _precision_of(fit)
     yield _Section("Parameters", [_parameter_row(fit, precision, p) for p in fit.model.parameters], _PARAMETER_HEAD)
-    yield from _precision_sections(precision)
+    if isinstance(precision, Precision):
+        yield from _precision_sections(precision)
+    else:
+        yield _Section("No standard errors", [(precision,)])
     if fit.model.initial:
         yield _initial_section(fit)
-    yield _Section("Warnings", [(warning,) for warning in fit.warnings or ("none",)])
+    if not first:
+        yield _warnings(fit)
+
+
+def _warnings(fit: Fit) -> _Section:
+    return _Section("Warnings", [(warning,) for warning in fit.warnings or ("none",)])
+
+
+def _precision_of(fit: Fit) -> Precision | str:
+    """Return how sure the parameters are, or why that cannot be said: a fit that fails is printed all the same."""
+    try:
+        return fit.precision()
+    except ValueError as refusal:
+        return str(refusal)
 
 
 def _model_rows(model: Model) -> Sequence[tuple[str, ...]]:
@@ -93,7 +116,7 @@ def _statistics_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
         ("refinement", _refinement(effort)),
         ("samples", f"{samples} measured"),
         ("unknowns", _unknowns(fit)),
-        ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}"),
+        ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}" if math.isfinite(fit.cost) else NOT_FINITE),
     ]
     if fit.huber is not None:
         rows.insert(2, ("residuals", f"weighed linearly beyond {fit.huber:g} standard deviations (Huber)"))
@@ -133,12 +156,12 @@ def _output_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     deviation = {name: math.sqrt(variance) for name, variance in fit.noise_variance.items()}
     units = {name: fit.model.unit(name) for name in fit.outputs}
     return [
-        (name, f"{rmse[name]:.3e} {unit}", f"{fit_percent[name]:.2f} %", f"{deviation[name]:.3e} {unit}")
+        (name, _quantity(rmse[name], unit), percent_of_fit(fit_percent[name]), _quantity(deviation[name], unit))
         for name, unit in units.items()
     ]
 
 
-def _parameter_row(fit: Fit, precision: Precision, parameter: Parameter) -> tuple[str, ...]:
+def _parameter_row(fit: Fit, precision: Precision | str, parameter: Parameter) -> tuple[str, ...]:
     name, symbol, unit = parameter.name, parameter.symbol, parameter.unit
     if name not in fit.parameters:
         return name, symbol, f"{parameter.value:.6g}", "", unit, "(fixed)"
@@ -146,7 +169,20 @@ def _parameter_row(fit: Fit, precision: Precision, parameter: Parameter) -> tupl
     return name, symbol, f"{fit.parameters[name]:.6g}", _error(precision, name), unit, bounds
 
 
-def _error(precision: Precision, name: str) -> str:
+def _quantity(value: float, unit: str) -> str:
+    return f"{value:.3e} {unit}" if math.isfinite(value) else NOT_FINITE
+
+
+def percent_of_fit(percent: float) -> str:
+    """Return MATLAB's fit in words that can be meant, whatever it is."""
+    if not math.isfinite(percent):
+        return NOT_FINITE
+    return f"{percent:.2f} %" if percent > -_ABSURD else f"below -{_ABSURD:g} %"
+
+
+def _error(precision: Precision | str, name: str) -> str:
+    if isinstance(precision, str):
+        return "not known"
     error, value = precision.standard_errors[name], precision.values[name]
     if not math.isfinite(error):
         return "not fixed"
@@ -154,7 +190,13 @@ def _error(precision: Precision, name: str) -> str:
 
 
 def _percent(share: float) -> str:
+    if share > _ABSURD:
+        return f"over {_ABSURD:g}%"
     return f"{share:.2f}%" if share >= 0.1 else f"{share:.2g}%"
+
+
+def _share(deviation: float) -> str:
+    return f"{100 * deviation:.2g}%" if 100 * deviation <= _ABSURD else f"over {_ABSURD:g}%"
 
 
 def _precision_sections(precision: Precision) -> Iterator[_Section]:
@@ -185,7 +227,7 @@ def _direction(direction: Direction) -> str:
     up = [name for name, weight in direction.weights.items() if weight > 0]
     down = [name for name, weight in direction.weights.items() if weight < 0]
     words = f"{', '.join(up)} up" + (f", {', '.join(down)} down" if down else "") if len(up + down) > 1 else up[0]
-    return words if math.isinf(direction.deviation) else f"{words} (to {100 * direction.deviation:.2g}%)"
+    return words if math.isinf(direction.deviation) else f"{words} (to {_share(direction.deviation)})"
 
 
 def _initial_section(fit: Fit) -> _Section:
@@ -197,7 +239,9 @@ def _initial_section(fit: Fit) -> _Section:
 
 
 def _text_lines(section: _Section) -> list[str]:
-    rows = [section.head, *section.rows] if section.head else section.rows
+    table = [section.head, *section.rows] if section.head else section.rows
+    # A name with a new line in it would tear its row apart.
+    rows = [[" ".join(cell.splitlines()) for cell in row] for row in table]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     return [f"[[{section.title}]]", *(f"    {line}".rstrip() for line in lines)]

@@ -1,15 +1,22 @@
 """From a model and records to a `Problem`: what is searched, between which bounds, and how noisy each output is."""
 
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.arguments import by_name, number, positive
 from ehsvjax.models.model import Model, Parameter
-from ehsvjax.population import Problem, coordinates_of, observed_outputs, stack_records
+from ehsvjax.population import Coordinates, Problem, coordinates_of, observed_outputs, stack_records
 from ehsvjax.record import Record
 
 Initial = str | Mapping[str, float] | Sequence[Mapping[str, float]]
+
+# First readings that tell where an initial condition lies; how far beyond them it may lie, in ranges of the output and
+# in standard deviations of its noise.
+_FIRST = 5
+_REACH_OF_RANGE, _REACH_OF_NOISE = 0.1, 3.0
 
 
 def problem_of(
@@ -40,7 +47,7 @@ def problem_of(
     samples, grid = stack_records(model, records)
     unknowns = [model.parameter(name) for name in model.free]
     for record in records:
-        unknowns += [_around_first_samples(model.parameter(name), record) for name in free_initial]
+        unknowns += [_wide_enough(model.parameter(name), record) for name in free_initial]
     _check_enough_samples(model, records, samples.measured, unknowns)
     return Problem(
         samples=samples,
@@ -60,6 +67,17 @@ def problem_of(
         free_initial=free_initial,
         huber=_checked_huber(huber),
     )
+
+
+def where_to_search(model: Model, records: Sequence[Record], problem: Problem) -> Coordinates:
+    """Return the coordinates in which to search first: initial conditions within what their outputs first show.
+
+    Within the bounds, and only a place to start from: a refinement has all of the bounds.
+    """
+    unknowns = [model.parameter(name) for name in problem.free]
+    for record in records:
+        unknowns += [_as_first_shown(model.parameter(name), record) for name in problem.free_initial]
+    return coordinates_of(unknowns)
 
 
 def guess_noise_variance(output: Float[np.ndarray, " time"]) -> float:
@@ -83,34 +101,62 @@ def _given_initial(model: Model, records: Sequence[Record], initial: Initial) ->
         if initial not in ("estimate", "nominal"):
             raise ValueError(f"expected initial 'estimate', 'nominal' or known values by name, got {initial!r}")
         return [held | {p.name: p.value for p in model.initial if initial == "nominal"}] * len(records)
-    per_record = [initial] * len(records) if isinstance(initial, Mapping) else list(initial)
+    per_record = [initial] * len(records) if isinstance(initial, Mapping) else initial
+    if not isinstance(per_record, Sequence):
+        raise ValueError(f"expected initial 'estimate', 'nominal' or known values by name, got {initial!r}")
     if len(per_record) != len(records):
         raise ValueError(f"expected initial conditions for each of {len(records)} records, got {len(per_record)}")
-    if any(set(given) != set(per_record[0]) for given in per_record):
+    known = [by_name("initial conditions", given) for given in per_record]
+    if any(set(given) != set(known[0]) for given in known):
         raise ValueError("expected the same initial conditions to be known in every record, got different names")
-    for given in per_record:
-        for name, value in given.items():
-            if name not in names:
-                known = ", ".join(names)
-                raise ValueError(f"expected an initial condition of {model.name}, got {name!r}; it has {known}")
-            if not np.isfinite(value):
-                raise ValueError(f"expected a finite value for {name}, got {value}")
-    return [held | dict(given) for given in per_record]
+    for name in known[0]:
+        if name not in names:
+            there = ", ".join(names) or "none"
+            raise ValueError(f"expected an initial condition of {model.name}, got {name!r}; it has {there}")
+    return [held | {name: number(name, value) for name, value in given.items()} for given in known]
 
 
-def _around_first_samples(parameter: Parameter, record: Record) -> Parameter:
-    """Return the initial condition with bounds around the first samples of the output that shows it.
+class _Shown(NamedTuple):
+    """Where an output starts: between the least and the largest of its first readings, give or take the reach."""
 
-    Five samples, give or take a tenth of the output's range and five times its noise: wide enough for an output that
-    moves at once, and far narrower than anything that it could ever be.
+    least: float
+    most: float
+    reach: float
+
+
+def _first_shown(parameter: Parameter, record: Record) -> _Shown | None:
+    """Return where the output that shows an initial condition starts; None if it is not measured.
+
+    From the least to the largest of the first readings, as a signal may turn at once and a reading may be a spike; by
+    their steepest step farther for every sample that is missing before them; and give or take a tenth of the output's
+    range and three times its noise.
     """
     output = record.outputs.get(parameter.output) if parameter.output else None
     if output is None:
+        return None
+    present = np.flatnonzero(np.isfinite(output))
+    first = output[present[:_FIRST]]
+    slopes = np.abs(np.diff(first) / np.diff(present[:_FIRST]))
+    reach = _REACH_OF_RANGE * float(np.ptp(output[present])) + _REACH_OF_NOISE * guess_noise_variance(output) ** 0.5
+    return _Shown(float(np.min(first)), float(np.max(first)), reach + float(present[0] * np.max(slopes, initial=0.0)))
+
+
+def _wide_enough(parameter: Parameter, record: Record) -> Parameter:
+    """Return the initial condition with its bounds; where the first readings lie beyond them, wide enough for those."""
+    shown = _first_shown(parameter, record)
+    if shown is None or parameter.lower <= shown.least <= shown.most <= parameter.upper:
         return parameter
-    measured = output[np.isfinite(output)]
-    centre = float(np.median(measured[:5]))
-    reach = 0.1 * float(np.ptp(measured)) + 5.0 * guess_noise_variance(output) ** 0.5
-    return parameter._replace(value=centre, lower=centre - reach, upper=centre + reach, scale="linear")
+    lower, upper = min(parameter.lower, shown.least - shown.reach), max(parameter.upper, shown.most + shown.reach)
+    return parameter._replace(lower=lower, upper=upper, scale=parameter.scale if lower > 0 else "linear")
+
+
+def _as_first_shown(parameter: Parameter, record: Record) -> Parameter:
+    """Return the initial condition between what its output first shows, within its bounds."""
+    shown, parameter = _first_shown(parameter, record), _wide_enough(parameter, record)
+    if shown is None:
+        return parameter
+    lower = max(parameter.lower, shown.least - shown.reach)
+    return parameter._replace(lower=lower, upper=min(parameter.upper, shown.most + shown.reach), scale="linear")
 
 
 def _variances(model, records, observed, given) -> Float[np.ndarray, " signal"]:
@@ -121,24 +167,19 @@ def _variances(model, records, observed, given) -> Float[np.ndarray, " signal"]:
                 for name in observed
             ]
         )
+    given = by_name("noise_variance", given)
     if set(given) != set(observed):
         raise ValueError(
             f"expected the noise variance of each measured output of {model.name}, {', '.join(observed)}; "
             f"got {', '.join(given) or 'none'}"
         )
-    for name, variance in given.items():
-        if not (np.isfinite(variance) and variance > 0):
-            unit = model.unit(name)
-            raise ValueError(f"expected a positive noise variance of {name}, in ({unit})^2, got {variance}")
-    return np.array([float(given[name]) for name in observed])
+    words = {name: f"a positive noise variance of {name}, in ({model.unit(name)})^2" for name in observed}
+    return np.array([positive(words[name], given[name]) for name in observed])
 
 
 def _checked_huber(huber):
-    if huber is not None and not (np.isfinite(huber) and huber > 0):
-        raise ValueError(
-            f"expected huber to be a positive number of standard deviations (1.345 is usual) or None, got {huber}"
-        )
-    return None if huber is None else float(huber)
+    words = "huber to be a positive number of standard deviations (1.345 is usual) or None"
+    return None if huber is None else positive(words, huber)
 
 
 def _check_enough_samples(model, records, measured, unknowns):

@@ -1,11 +1,15 @@
 """Directions that a record does not fix, what is fixed all the same, and what would fix them."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
 
 import ehsvjax
 from ehsvjax import excitation
+from ehsvjax.precision.standard_errors import linearised, precision_of
+from ehsvjax.unknowns import problem_of
 from tests import plants
 
 PERIOD = 1e-3
@@ -177,3 +181,71 @@ def test_parameters_that_show_alike_but_weakly_are_not_fixed_and_a_longer_record
     assert direction.deviation == pytest.approx(2.0, rel=1e-6)
     assert np.isinf(found.standard_errors["third"]) and np.isfinite(found.standard_errors["first"])
     assert "times the amplitude" in direction.remedy or "times its length" in direction.remedy
+
+
+@pytest.mark.parametrize(
+    ("output", "bounds", "name", "value"),
+    [
+        (lambda p, i: p["first"] * p["second"] * i["u"], (-5.0, 5.0), "first x second", 3.0),
+        (lambda p, i: (p["first"] + p["second"]) * i["u"], (0.1, 5.0), "first + second", 3.5),
+    ],
+    ids=["product whose bounds hold zero", "sum of positive ones"],
+)
+def test_exchangeable_parameters_are_said_to_be_and_what_of_them_is_fixed(output, bounds, name, value):
+    model = _of_two_inputs(output).with_bounds({"first": bounds, "second": bounds}, {"third": 1.0, "fourth": 1.0})
+    found = ehsvjax.design(model, STATIC, noise_variance={"y": 1.0}, parameters={"first": 1.5, "second": 2.0})
+    assert all(np.isinf(error) for error in found.standard_errors.values())
+    (direction,) = found.unfixed
+    assert set(direction.weights) == {"first", "second"}
+    assert "exchanged, the two give the same outputs" in direction.remedy
+    (combination,) = found.combinations
+    assert set(combination.name.split()) == set(name.split()) and combination.value == pytest.approx(value)
+    # The record shows it alone, as a gain of u: the error of a mean of 50.
+    assert combination.standard_error == pytest.approx(50**-0.5, rel=1e-6)
+
+
+def test_parameters_that_cannot_be_exchanged_are_not_said_to_be():
+    model = _of_two_inputs(lambda p, i: p["third"] * p["fourth"] ** 2 * i["w"])
+    found = ehsvjax.design(model.with_bounds(fixed={"first": 1.0, "second": 1.0}), STATIC, noise_variance={"y": 1.0})
+    assert found.unfixed and not any("exchanged" in direction.remedy for direction in found.unfixed)
+
+
+def _precision_under(coefficient, output, variance, samples=400):
+    """Return the precision of a fit whose residuals are an autoregression of that coefficient."""
+    rng = np.random.default_rng(8)
+    inputs = {name: np.repeat(rng.choice([-1.0, 1.0], samples // 40), 40) for name in ("u", "w")}
+    noise = np.zeros(samples)
+    for k in range(1, samples):
+        noise[k] = coefficient * noise[k - 1] + rng.normal(0.0, variance**0.5)
+    model = _of_two_inputs(output).with_bounds(fixed={"third": 1.0, "fourth": 1.0})
+    record = ehsvjax.Record(np.arange(float(samples)), inputs)
+    clean = ehsvjax.simulate(model, record)["y"]
+    problem = problem_of(model, [replace(record, outputs={"y": clean + noise})], noise_variance={"y": variance})
+    point = np.array([1.0, 1.0])
+    return precision_of(model, problem, linearised(problem, point, noise_variance_given=False))
+
+
+def test_what_is_fixed_all_the_same_has_the_errors_of_the_noise_there_is():
+    # The gain of u as one number, and as a sum of two that nothing tells apart.
+    alone = _precision_under(0.9, lambda p, i: p["first"] * i["u"] + p["second"] * i["w"], 1e-4)
+    tied = _precision_under(0.9, lambda p, i: (p["first"] + p["second"]) * i["u"] + 0.0 * i["w"], 1e-4)
+    (combination,) = tied.combinations
+    assert alone.coloured and tied.coloured
+    assert combination.standard_error == pytest.approx(alone.standard_errors["first"], rel=0.2)
+
+
+def test_what_coloured_noise_leaves_open_is_said_too():
+    # White noise of that size would fix the gains; slow noise does not, and that is then no mystery.
+    found = _precision_under(0.97, lambda p, i: p["first"] * i["u"] + p["second"] * i["w"], 400.0)
+    open_ = {name for name, error in found.standard_errors.items() if np.isinf(error)}
+    assert open_
+    assert open_ <= {name for direction in found.unfixed for name in direction.weights}
+
+
+def test_a_parameter_with_an_error_of_its_own_is_given_no_other():
+    # A direction that is open but for a little of the third: its own error is known.
+    model = _of_two_inputs(lambda p, i: (p["fourth"] + 0.05 * p["third"]) * i["u"] + p["third"] * i["w"])
+    model = model.with_bounds(fixed={"first": 1.0, "second": 1.0})
+    found = ehsvjax.design(model, STATIC, noise_variance={"y": 60.0})
+    stated = {name for name, error in found.standard_errors.items() if np.isfinite(error)}
+    assert not any(next(iter(c.exponents)) in stated for c in found.combinations)

@@ -135,3 +135,74 @@ def test_notebooks_find_a_picture_in_the_figure():
 )
 def test_quantities_take_the_prefix_that_reads_best(value, unit, shown):
     assert _quantity(value, unit) == shown
+
+
+_HOSTILE = r"a_b $x^{ <b>&\frac{1}{ \n$$$"
+
+
+def _with_hostile_names():
+    """Return a fit whose every name and unit a formula, a tag or a new line could be read into."""
+    model = hand_made.amplifier()
+    record = hand_made.record(_HOSTILE)
+
+    def renamed(part):
+        return part._replace(name=f"{part.name} {_HOSTILE}", unit=f"{part.unit}$_{{<\n")
+
+    def measure(parameters, state, inputs, signal):
+        plain = {name.split()[0]: value for name, value in parameters.items()}
+        given = {name.split()[0]: value for name, value in inputs.items()}
+        outputs = model.measure(plain, state, given, signal)
+        return {f"{name} {_HOSTILE}": value for name, value in outputs.items()}
+
+    def start(parameters, initial, inputs):
+        return model.start(parameters, {name.split()[0]: value for name, value in initial.items()}, inputs)
+
+    hostile = replace(
+        model,
+        name=_HOSTILE,
+        parameters=tuple(renamed(p)._replace(symbol=_HOSTILE) for p in model.parameters),
+        initial=tuple(renamed(p) for p in model.initial),
+        signals=tuple(renamed(s) for s in model.signals),
+        start=start,
+        measure=measure,
+    )
+    force = f"force {_HOSTILE}"
+    record = replace(
+        record,
+        inputs={f"command {_HOSTILE}": record.inputs["command"]},
+        outputs={force: np.append(record.outputs["force"][:3], 8.6)},
+    )
+    return hand_made.fit(
+        record,
+        model=hostile,
+        parameters={f"gain {_HOSTILE}": 2.0},
+        initial=({f"initial_load {_HOSTILE}": 0.5},),
+        noise_variance={force: 0.01},
+        history=hand_made.fit().history._replace(best={f"gain {_HOSTILE}": np.array([3.0, 2.2, 2.1])}),
+    )
+
+
+def test_any_name_is_drawn_letter_by_letter():
+    fit = _with_hostile_names()
+    figures = {
+        "fit": fit.plot(),
+        "identification": plot_identification(fit, {fit.outputs[0]: TRUE_FORCE}),
+        "profiles": fit.profile_likelihood().plot(),
+    }
+    for name, figure in figures.items():
+        assert to_png(figure, 30.0).startswith(b"\x89PNG"), name
+    drawn = figures["fit"].get_suptitle()
+    assert "\n" not in drawn and drawn.count("$") == drawn.count(r"\$") == 2 * _HOSTILE.count("$")
+
+
+def test_any_name_is_printed_on_its_line():
+    fit = _with_hostile_names()
+    text = str(fit)
+    assert all(line.startswith(("[[", "    ")) for line in text.splitlines())
+    assert "&lt;b&gt;" in fit._repr_html_()
+    assert str(fit.profile_likelihood()).count("\n") == 1
+
+
+def test_a_history_that_failed_at_first_is_drawn():
+    history = hand_made.fit().history._replace(best_cost=np.array([np.inf, 9.0, 3.1]))
+    assert to_png(hand_made.fit(history=history).plot(), 30.0).startswith(b"\x89PNG")

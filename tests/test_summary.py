@@ -1,9 +1,13 @@
+import math
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 
-from ehsvjax.summary import summary, summary_html
+from ehsvjax.precision.residual_noise import ResidualNoise
+from ehsvjax.precision.standard_errors import _worth
+from ehsvjax.summary import percent_of_fit, summary, summary_html
 from tests import hand_made
 
 # rmse: three errors of 0.1. fit: 100*(1 - sqrt(0.03/18.96)), 18.96 = 2.6^2 + 0.8^2 + 3.4^2 about the mean 5.2.
@@ -133,3 +137,47 @@ def test_html_escapes_what_users_write():
     assert set(page.tags) <= {"div", "p", "b", "table", "tr", "th", "td"}
     assert set(page.attributes) <= {"style"}
     assert {hostile, "<b>k</b>", "<i>", "<h1>", "a < b"} <= set(page.texts)
+
+
+def test_a_model_that_explains_nothing_has_its_warnings_first():
+    text = summary(hand_made.fit(warnings=("the model explains nothing of force: fit -3 %", "not refined")))
+    assert text.startswith(
+        "[[Warnings]]\n    the model explains nothing of force: fit -3 %\n    not refined\n[[Model]]"
+    )
+    assert text.count("[[Warnings]]") == 1
+
+
+@pytest.mark.parametrize(
+    ("percent", "shown"),
+    [(96.024, "96.02 %"), (-73.0, "-73.00 %"), (-1.2e9, "below -1000 %"), (-math.inf, "not finite")],
+)
+def test_a_fit_is_said_in_numbers_that_can_be_meant(percent, shown):
+    assert percent_of_fit(percent) == shown
+
+
+def test_errors_beyond_measure_are_said_to_be():
+    precision = replace(hand_made.fit().precision(), standard_errors={"gain": 1e9})
+    assert "(over 1000%)" in str(precision)
+
+
+def test_a_name_with_a_new_line_stays_in_its_row():
+    text = summary(hand_made.fit(hand_made.record("bench\n7 $x_1$")))
+    assert "    bench 7 $x_1$  4 " in text
+
+
+def _noise(coefficients, variance=1.0):
+    coefficients = np.array(coefficients)
+    # Of an autoregression of first order.
+    return ResidualNoise(0.0, coefficients, variance, variance * (1.0 - float(np.sum(coefficients**2))))
+
+
+@pytest.mark.parametrize(
+    ("coefficient", "words"),
+    [
+        (0.9, "19 samples (190 ms) tell as much as one"),
+        (-0.9, "whose swings cancel: of a constant one sample tells as much as 19 with white noise"),
+        (0.9999, "which all 500 samples together do not average out"),
+    ],
+)
+def test_what_samples_tell_under_coloured_noise_is_a_number_that_can_be_meant(coefficient, words):
+    assert _worth(_noise([coefficient]), 0.01, 500) == words

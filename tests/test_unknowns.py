@@ -1,12 +1,14 @@
 """From records to a problem: noise guessed from a record, bounds of initial conditions, and what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ehsvjax
-from ehsvjax.unknowns import guess_noise_variance, problem_of
+from ehsvjax.unknowns import guess_noise_variance, problem_of, where_to_search
 
 TIME = np.arange(2000) * 1e-3
 SMOOTH = np.sin(40.0 * TIME) + 0.3 * np.cos(95.0 * TIME)
@@ -62,6 +64,49 @@ def test_bounds_given_for_an_initial_condition_stand():
     model = ehsvjax.van_der_pol().with_bounds({"initial_position": (-7.0, 9.0)})
     problem = problem_of(model, [_record()])
     assert (problem.coordinates.lower[2], problem.coordinates.upper[2]) == (-7.0, 9.0)
+
+
+def _with_bounds_of_start(lower, upper):
+    model = ehsvjax.van_der_pol()
+    initial = tuple(p._replace(lower=lower, upper=upper) if p.output else p for p in model.initial)
+    return replace(model, initial=initial)
+
+
+def _bounds(coordinates):
+    return coordinates.lower[2], coordinates.upper[2]
+
+
+def test_bounds_of_a_users_model_stand_and_the_search_begins_where_the_output_does():
+    # An oscillation that turns over within five samples: their median says nothing of the first.
+    oscillating = 0.2 * np.cos(2.2 * np.arange(300))
+    records = [_record(oscillating)]
+    model = _with_bounds_of_start(-0.3, 0.3)
+    problem = problem_of(model, records)
+    assert _bounds(problem.coordinates) == (-0.3, 0.3)
+    lower, upper = _bounds(where_to_search(model, records, problem))
+    assert -0.3 <= lower < oscillating[0] < upper <= 0.3
+
+
+def test_bounds_that_the_first_readings_contradict_are_wide_enough_for_them():
+    records = [_record(5.0 + 0.2 * np.cos(0.1 * np.arange(300)))]
+    model = _with_bounds_of_start(-0.3, 0.3)
+    lower, upper = _bounds(problem_of(model, records).coordinates)
+    assert lower == -0.3 and upper > 5.2
+    lower, upper = _bounds(where_to_search(model, records, problem_of(model, records)))
+    assert 4.5 < lower < 5.2 < upper < 6.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.floats(0.05, 3.0), st.floats(0.0, 6.3), st.integers(0, 8), st.integers(0, 10**6))
+def test_the_search_begins_about_the_true_start_of_an_oscillation(speed, phase, missing, seed):
+    # Up to some six samples a period, the first readings missing, one of them a spike.
+    true = np.cos(speed * np.arange(300) / 3.0 + phase)
+    position = true + np.random.default_rng(seed).normal(0.0, 0.01, 300)
+    position[missing + seed % 5] += 3.0 * (seed % 2)
+    position[:missing] = np.nan
+    model, records = ehsvjax.van_der_pol(), [_record(position)]
+    lower, upper = _bounds(where_to_search(model, records, problem_of(model, records)))
+    assert lower < true[0] < upper
 
 
 MODEL = ehsvjax.van_der_pol()

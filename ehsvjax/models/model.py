@@ -45,8 +45,9 @@ class Parameter(NamedTuple):
 
     `value` is the nominal value, used where the parameter is fixed; `scale` says in which coordinate the search moves:
     "log" for positive quantities known by their order of magnitude. For an initial condition, `output` names the output
-    whose first samples tell about where it lies, if that output is measured. A constant is taken to be what it is given
-    as, and may have been given wrong: `diagnose` tries that too, unless it is `certain`.
+    whose first samples tell about where it lies, if that output is measured: the search begins there. The bounds stand,
+    but where those samples lie beyond them; bounds given to `identify` stand in any case. A constant is taken to be
+    what it is given as, and may have been given wrong: `diagnose` tries that too, unless it is `certain`.
     """
 
     name: str

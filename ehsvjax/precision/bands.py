@@ -24,8 +24,34 @@ class Band(NamedTuple):
 def deviations(
     found: Sensitivities, covariance: Float[np.ndarray, "parameter parameter"]
 ) -> Float[np.ndarray, "record time signal"]:
-    """Return the standard deviation of each simulated output due to the unknowns', in noise standard deviations."""
-    return np.sqrt(np.maximum(np.einsum("...p,pq,...q->...", found.jacobian, covariance, found.jacobian), 0.0))
+    """Return the standard deviation of each simulated output due to the unknowns', in noise standard deviations.
+
+    It is +inf where the simulation is not finite.
+    """
+    return _root(found, np.einsum("...p,pq,...q->...", found.jacobian, covariance, found.jacobian))
+
+
+def new_deviations(
+    found: Sensitivities, covariance: Float[np.ndarray, "parameter parameter"], factor: float
+) -> Float[np.ndarray, "record time signal"]:
+    """Return the same for a record that was not fitted, whose initial conditions are estimated from its own readings.
+
+    Args:
+        found: on that record.
+        covariance: of the parameters.
+        factor: variance of its noise, in the problem's.
+
+    """
+    known = found._replace(
+        jacobian=np.where(found.finite[..., None], found.jacobian, 0.0), measured=found.measured & found.finite
+    )
+    by_parameters, by_initial = total_sensitivities(known)
+    variance = np.einsum("...p,pq,...q->...", by_parameters, covariance, by_parameters)
+    return _root(found, variance + factor * np.sum(by_initial**2, axis=-1))
+
+
+def _root(found: Sensitivities, variance) -> Float[np.ndarray, "record time signal"]:
+    return np.where(found.finite, np.sqrt(np.maximum(variance, 0.0)), np.inf)
 
 
 def total_sensitivities(

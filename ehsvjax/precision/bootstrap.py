@@ -1,5 +1,6 @@
 """The bootstrap: refit records drawn anew from the fit, all draws in one batch, without any formula for the errors."""
 
+import warnings
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -9,6 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
+from ehsvjax.arguments import one_of, whole_number
+from ehsvjax.draws import check_key
 from ehsvjax.population import Problem, cast, to_unit, to_values
 from ehsvjax.precision.residual_noise import ResidualNoise
 from ehsvjax.precision.standard_errors import quantile_of
@@ -34,13 +37,17 @@ class Bootstrap(NamedTuple):
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Name -> standard deviation over the draws, SI."""
-        return {name: float(np.std(values, ddof=1)) for name, values in self.parameters.items()}
+        """Name -> standard deviation over the draws, SI; +inf where fewer than two refits converged."""
+        return {
+            name: float(np.std(values, ddof=1)) if len(values) > 1 else np.inf
+            for name, values in self.parameters.items()
+        }
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Return name -> (lower, upper), the basic interval: the estimate less the draws' own deviations.
 
-        Davison & Hinkley 1997, Bootstrap Methods and their Application, section 5.2.
+        Davison & Hinkley 1997, Bootstrap Methods and their Application, section 5.2. Infinite where fewer than two
+        refits converged.
 
         Raises:
             ValueError: unless the level is between 0 and 1.
@@ -50,6 +57,9 @@ class Bootstrap(NamedTuple):
         tail = 0.5 * (1.0 - level)
         found = {}
         for name, values in self.parameters.items():
+            if len(values) < 2:
+                found[name] = (-np.inf, np.inf)
+                continue
             low, high = np.quantile(values, [tail, 1.0 - tail])
             found[name] = (float(2.0 * self.estimates[name] - high), float(2.0 * self.estimates[name] - low))
         return found
@@ -83,10 +93,9 @@ def bootstrap(
         ValueError: for an unknown kind, or fewer than 2 draws.
 
     """
-    if kind not in ("parametric", "block"):
-        raise ValueError(f"expected kind 'parametric' or 'block', got {kind!r}")
-    if isinstance(draws, bool) or not isinstance(draws, int) or draws < 2:
-        raise ValueError(f"expected draws to be a whole number of at least 2, got {draws!r}")
+    check_key(key)
+    one_of("kind", kind, ("parametric", "block"))
+    whole_number("draws", draws, 2)
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
     deviation = np.sqrt(problem.noise_variance)
     shape = simulated.shape[:2]
@@ -105,6 +114,9 @@ def bootstrap(
     with jax.enable_x64(True):
         individuals, converged = _refits(cast(problem, jnp.float64), jnp.asarray(drawn), jnp.asarray(start))
     refitted, good = to_values(problem.coordinates, np.asarray(individuals)), np.asarray(converged)
+    if not good.all():
+        words = f"{np.sum(~good)} of {draws} refits failed or did not converge, and are left out"
+        warnings.warn(words, RuntimeWarning, stacklevel=4)
     return Bootstrap(
         {name: refitted[good, i] for i, name in enumerate(problem.free)},
         {name: float(values[i]) for i, name in enumerate(problem.free)},

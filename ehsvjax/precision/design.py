@@ -8,7 +8,7 @@ import numpy as np
 from ehsvjax.checks import by_name, instance, positive, several
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
-from ehsvjax.precision.sensitivities import sensitivities
+from ehsvjax.precision.sensitivities import check_finite, sensitivities
 from ehsvjax.precision.standard_errors import Precision, covariance_of, linearised, precision_of
 from ehsvjax.record import Record
 from ehsvjax.simulate import changed, simulate
@@ -84,6 +84,7 @@ def cramer_rao_bound(
     records = _checked(model, records, noise_variance)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance)
     found = sensitivities(problem, _point(model, problem, parameters, initial_values))
+    check_finite(problem, found)
     covariance, seen = covariance_of(found, None, 1.0)
     deviations = np.where(seen, np.sqrt(np.diagonal(covariance)) * found.scale, np.inf)
     return {name: float(deviation) for name, deviation in zip(problem.free, deviations, strict=False)}

@@ -9,7 +9,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities
 
@@ -91,6 +91,21 @@ def spectrum(root: Float[np.ndarray, "parameter parameter"]) -> Spectrum:
     return Spectrum(vectors.T, np.where(seen, 1.0 / np.where(seen, values, 1.0), np.inf))
 
 
+def of_covariance(white: Spectrum, covariance: Float[np.ndarray, "parameter parameter"]) -> Spectrum:
+    """Return the directions of a covariance that is not the inverse of the information: noise was coloured.
+
+    Where the sensitivities are rounding, nothing shows whatever the noise; the rest has the covariance's own axes.
+    """
+    shown = np.isfinite(white.deviation)
+    basis = white.directions[:, shown]
+    variances, axes = np.linalg.eigh(basis.T @ covariance @ basis)
+    deviation = np.sqrt(np.maximum(variances, 0.0))
+    return Spectrum(
+        np.concatenate([basis @ axes, white.directions[:, ~shown]], axis=1),
+        np.concatenate([deviation, white.deviation[~shown]]),
+    )
+
+
 def parameter_root(found: Sensitivities) -> Float[np.ndarray, "parameter parameter"]:
     """Return R with R^T R the information of the free parameters, that of the initial conditions eliminated."""
     rows, count = found.rows, len(found.names)
@@ -119,14 +134,17 @@ def taking_part(unfixed: Float[np.ndarray, "parameter direction"]) -> np.ndarray
     return np.linalg.norm(unfixed, axis=1) > _TAKES_PART
 
 
-def combinations(found: Sensitivities, fixed: Spectrum) -> tuple[Combination, ...]:
-    """Return what is fixed of each parameter that is not, but for as many as there are directions.
+def combinations(
+    found: Sensitivities, fixed: Spectrum, not_fixed: Bool[np.ndarray, " parameter"]
+) -> tuple[Combination, ...]:
+    """Return what is fixed of each parameter that itself is `not_fixed`, but for as many as there are directions.
 
     The parameters left over are those by which the others are multiplied or divided, chosen so that the largest error
     of a combination is least. Relative changes combine as products of powers, others as sums.
     """
     unfixed = fixed.unfixed
-    tied = np.flatnonzero(taking_part(unfixed))
+    # One that has a standard error of its own needs no other.
+    tied = np.flatnonzero(taking_part(unfixed) & not_fixed)
     count = unfixed.shape[1]
     if count == 0 or len(tied) <= count:
         return ()
@@ -156,17 +174,35 @@ def _choices(unfixed: Float[np.ndarray, "parameter direction"], tied: np.ndarray
 
 
 def _combination(found: Sensitivities, vector: np.ndarray, error: float) -> Combination:
+    """Return the combination as a product of powers or as a sum, whichever has the plainer powers or factors.
+
+    To first order both say the same; where neither is plainer it is a product of relative changes, otherwise a sum.
+    """
     taking = [i for i in _largest_first(vector) if abs(vector[i]) > _TAKES_PART]
-    names = found.names
-    if all(found.relative[i] for i in taking):
-        powers = {names[i]: _rounded(vector[i]) for i in taking}
-        value = float(np.prod([found.values[i] ** vector[i] for i in taking]))
-        return Combination(_product(powers), powers, value, abs(value) * error)
+    names, first = [found.names[i] for i in taking], taking[0]
+    values, scale, weights = found.values[taking], found.scale[taking], vector[taking]
+    factors = dict(zip(names, (weights * scale[0] / scale / weights[0]).tolist(), strict=True))
+    # Relative changes by which the combination changes as much.
+    changes = weights * values / scale
+    unit = 1.0 if found.relative[first] or changes[0] == 0.0 else 1.0 / changes[0]
+    powers = {name: _rounded(unit * change) for name, change in zip(names, changes, strict=True)}
+    defined = all(
+        value > 0 or (value < 0 and powers[name].is_integer()) for name, value in zip(names, values, strict=True)
+    )
+    plainer = _denominators(factors) - _denominators(powers)
+    if defined and (plainer > 0 or (plainer == 0 and found.relative[taking].all())):
+        product = float(np.prod([value ** powers[name] for name, value in zip(names, values, strict=True)]))
+        return Combination(_product(powers), powers, product, float(abs(product * unit) * error))
     # A sum, in the unit of the first.
-    first = taking[0]
-    factors = {names[i]: float(vector[i] * found.scale[first] / found.scale[i] / vector[first]) for i in taking}
-    value = float(sum(factor * found.values[names.index(name)] for name, factor in factors.items()))
-    return Combination(_sum(factors), factors, value, float(found.scale[first] * error / abs(vector[first])))
+    total = float(sum(factors[name] * value for name, value in zip(names, values, strict=True)))
+    return Combination(_sum(factors), factors, total, float(scale[0] * error / abs(weights[0])))
+
+
+def _denominators(numbers: dict[str, float]) -> int:
+    """Return how far from plain numbers are: the sum of their denominators, those that are no simple fraction apart."""
+    near = [Fraction(number).limit_denominator(4) for number in numbers.values()]
+    plain = all(abs(float(f) - number) < 1e-3 for f, number in zip(near, numbers.values(), strict=True))
+    return sum(f.denominator for f in near) if plain else 5 * len(near)
 
 
 def _rounded(power: float) -> float:
@@ -184,5 +220,8 @@ def _product(powers: dict[str, float]) -> str:
 
 
 def _sum(factors: dict[str, float]) -> str:
-    terms = [f"{'+' if factor > 0 else '-'} {abs(factor):.3g} {name}" for name, factor in factors.items()]
-    return " ".join(terms).removeprefix("+ ").removeprefix("1 ")
+    def term(name, factor):
+        size = f"{abs(factor):.3g}"
+        return f"{'+' if factor > 0 else '-'} {name if size == '1' else f'{size} {name}'}"
+
+    return " ".join(term(name, factor) for name, factor in factors.items()).removeprefix("+ ")

@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ehsvjax.fit import Fit
+from ehsvjax.failure import warn_of_failure
+from ehsvjax.fit import Fit, checked_record
 from ehsvjax.population import Problem
-from ehsvjax.precision.bands import Band, deviations, total_sensitivities
+from ehsvjax.precision.bands import Band, deviations, new_deviations
 from ehsvjax.precision.bootstrap import Bootstrap, bootstrap
 from ehsvjax.precision.profile import ProfileLikelihood, profile_likelihood
 from ehsvjax.precision.sensitivities import sensitivities
@@ -54,7 +55,11 @@ def profiles(fit: Fit, of: Prepared, names: Sequence[str] | None, level: float) 
         ValueError: for a name that is not identified, or a level that is none.
 
     """
+    if isinstance(names, str) or not isinstance(names, Sequence | None):
+        raise ValueError(f"expected names of parameters as a list, [name, ...], got {names!r}")
     names = of.problem.free if names is None else tuple(names)
+    if not names:
+        raise ValueError(f"expected names of parameters, of {', '.join(of.problem.free)}; got none")
     for name in names:
         if name not in of.problem.free:
             raise ValueError(f"expected parameters that were identified, {', '.join(of.problem.free)}; got {name!r}")
@@ -93,7 +98,7 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
         ValueError: if the record holds none of the outputs that were fitted.
 
     """
-    quantile = quantile_of(level)
+    quantile, record = quantile_of(level), checked_record(record)
     found, covariance, factor = of.first_order.found, of.first_order.covariance, _sample_variance(fit, of)
     noise = np.sqrt(of.problem.noise_variance)
     for i, fitted in enumerate(fit.records):
@@ -107,10 +112,9 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
     problem = _problem(fit, [record.select(outputs=names)], [start])
     values = [fit.parameters[name] for name in problem.free] + [start[name] for name in problem.free_initial]
     new = sensitivities(problem, np.array(values))
+    warn_of_failure(fit.model, record, {name: new.simulated[0, :, i] for i, name in enumerate(problem.observed)})
     count = len(new.names)
-    by_parameters, by_initial = total_sensitivities(new)
-    variance = np.einsum("...p,pq,...q->...", by_parameters, covariance[:count, :count], by_parameters)
-    spread = np.sqrt(np.maximum(variance + factor * np.sum(by_initial**2, axis=-1), 0.0))[0]
+    spread = new_deviations(new, covariance[:count, :count], factor)[0]
     return _bands(problem.observed, spread, np.sqrt(problem.noise_variance), factor, quantile)
 
 

@@ -3,6 +3,7 @@
 Unlike a standard error the interval follows a cost that is no parabola, and it ends at a bound where it reaches one.
 """
 
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -139,7 +140,13 @@ def profile_likelihood(
                                   quantile, last=True)
         for name, profile in found.items()
     }  # fmt: skip
-    lowest = min(cost for points in held.values() for _, cost in points)
+    every = np.array([cost for points in held.values() for _, cost in points])
+    if not np.isfinite(every).all():
+        words = (
+            f"{np.sum(~np.isfinite(every))} of {len(every)} refits could not be simulated, and count as infinitely bad"
+        )
+        warnings.warn(words, RuntimeWarning, stacklevel=4)
+    lowest = np.min(every)
     better = max(0.0, (least - lowest) / min(noise_factors.values()))
     places = {name: problem.free.index(name) for name in names}
     return ProfileLikelihood(
@@ -203,7 +210,8 @@ def _profile(problem, best, place: int, points, least: float, factor: float, qua
         beyond = np.flatnonzero(height >= quantile)
         if len(beyond):
             k = beyond[0]
-            share = (quantile - height[k - 1]) / (height[k] - height[k - 1])
+            # Where no refit could be simulated, the end is no nearer than that.
+            share = (quantile - height[k - 1]) / (height[k] - height[k - 1]) if np.isfinite(height[k]) else 1.0
             end = distance[k - 1] + share * (distance[k] - distance[k - 1])
             ends.append(best[place] + side * end)
             at_bound.append(False)

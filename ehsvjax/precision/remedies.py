@@ -14,6 +14,10 @@ from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, sensitiviti
 _AMPLITUDES = (0.1, 0.3, 1.25, 1.5, 2.0, 3.0, 5.0, 10.0)
 # A direction counts as fixed by another amplitude once it is known to this share.
 _WELL_FIXED = 0.2
+# Changes of the sum of squares, in noise variances, that are none.
+_NO_CHANGE = 1e-6
+# Times its length to which a record can be meant to be prolonged.
+_LONGEST = 1000.0
 
 
 def unfixed_directions(problem: Problem, found: Sensitivities, here: Spectrum) -> tuple[Direction, ...]:
@@ -33,7 +37,12 @@ def unfixed_directions(problem: Problem, found: Sensitivities, here: Spectrum) -
             others[amplitude] = spectrum(root)
     never = _shown_by_none(roots)
     structural = [
-        Direction(named(found.names, vector), float("inf"), structural=True, remedy=_structural_remedy(vector))
+        Direction(
+            named(found.names, vector),
+            float("inf"),
+            structural=True,
+            remedy=_structural_remedy(vector, _exchangeable(problem, found, vector)),
+        )
         for vector in _sparse(never).T
     ]
     practical = []
@@ -41,6 +50,8 @@ def unfixed_directions(problem: Problem, found: Sensitivities, here: Spectrum) -
         apart = vector - never @ (never.T @ vector)
         apart /= np.linalg.norm(apart)
         remedy = _remedy(problem, here, others, apart)
+        if _exchangeable(problem, found, vector):
+            remedy += "; exchanged, the two give the same outputs"
         practical.append(Direction(named(found.names, vector), here.along(apart), remedy=remedy))
     return (*structural, *practical)
 
@@ -78,10 +89,25 @@ def _sparse(vectors: Float[np.ndarray, "parameter direction"]) -> Float[np.ndarr
     return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).T
 
 
-def _structural_remedy(vector) -> str:
+def _exchangeable(problem: Problem, found: Sensitivities, vector) -> bool:
+    """Return whether two parameters, the only ones of a direction, can change places without any output showing it."""
+    pair = np.flatnonzero(np.abs(vector) > 1e-3)
+    if len(pair) != 2:
+        return False
+    apart, exchanged = (np.array(found.values, float) for _ in range(2))
+    # Equal values would change nothing whatever the model.
+    values = np.array([1.0, 1.1]) * found.values[pair]
+    apart[pair], exchanged[pair] = values, values[::-1]
+    one, other = (sensitivities(problem, point).simulated for point in (apart, exchanged))
+    difference = (one - other) / np.sqrt(problem.noise_variance)
+    return bool(np.sum(difference[found.measured] ** 2) < _NO_CHANGE)
+
+
+def _structural_remedy(vector, exchangeable: bool) -> str:
     if np.sum(np.abs(vector) > 1e-3) == 1:
         return "no record of these outputs shows it; fix it, or measure another output"
-    return "no record of these outputs tells them apart; fix one of them, or measure another output"
+    same = ": exchanged, the two give the same outputs" if exchangeable else ""
+    return f"no record of these outputs tells them apart{same}; fix one of them, or measure another output"
 
 
 def _remedy(problem: Problem, here: Spectrum, others: Mapping[float, Spectrum], vector) -> str:
@@ -100,5 +126,9 @@ def _remedy(problem: Problem, here: Spectrum, others: Mapping[float, Spectrum], 
             )
     if np.isfinite(here.along(vector)):
         times = (here.along(vector) / _WELL_FIXED) ** 2
+        if times > _LONGEST:
+            return (
+                "this record hardly shows it, nor would another amplitude or length; fix it, or measure another output"
+            )
         return f"this record hardly shows it, nor would another amplitude; {times:.2g} times its length would, to 20%"
     return "neither this record nor another amplitude shows it; fix it, or measure another output"

@@ -44,6 +44,11 @@ class Sensitivities(NamedTuple):
         """The jacobian's rows of measured samples."""
         return self.jacobian[self.measured]
 
+    @property
+    def finite(self) -> Bool[np.ndarray, "record time signal"]:
+        """Where the outputs and all of their derivatives are finite."""
+        return np.isfinite(self.simulated) & np.isfinite(self.jacobian).all(axis=-1)
+
 
 def sensitivities(problem: Problem, values: Float[np.ndarray, " parameter"]) -> Sensitivities:
     """Return the sensitivities at values of the unknowns, SI; the problem's arrays are NumPy's."""
@@ -66,6 +71,32 @@ def sensitivities(problem: Problem, values: Float[np.ndarray, " parameter"]) -> 
         simulated=np.asarray(y),
         jacobian=np.asarray(jacobian) * (scale / width) / deviation,
         measured=np.asarray(problem.samples.measured),
+    )
+
+
+def check_finite(problem: Problem, found: Sensitivities) -> None:
+    """Refuse what cannot be linearised where something was measured.
+
+    Raises:
+        ValueError: naming the output, the sample, and the unknown by which it has no finite derivative.
+
+    """
+    if np.isfinite(found.rows).all():
+        return
+    row = np.argwhere(found.measured & ~found.finite)[0]
+    record, sample, signal = (int(i) for i in row)
+    output, after = problem.observed[signal], sample * float(problem.samples.sample_period[record])
+    where = f"at sample {sample} of record {record}, {after:.6g} s after its start"
+    if not np.isfinite(found.simulated[tuple(row)]):
+        raise ValueError(
+            f"expected a simulation that stays finite, got none of {output} {where}: mind units, initial conditions "
+            "and max_step"
+        )
+    names = [*problem.free, *problem.free_initial * len(problem.samples.inputs)]
+    unknown = names[int(np.argmin(np.isfinite(found.jacobian[tuple(row)])))]
+    raise ValueError(
+        f"expected {output} to have a finite derivative by {unknown}, got none {where}: in the model's equations keep "
+        "both branches of jnp.where finite, and roots and logarithms off zero"
     )
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax.arguments import number, one_of
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
 from ehsvjax.precision.directions import (
@@ -15,13 +16,14 @@ from ehsvjax.precision.directions import (
     Direction,
     Spectrum,
     combinations,
+    of_covariance,
     parameter_root,
     spectrum,
     taking_part,
 )
 from ehsvjax.precision.remedies import unfixed_directions
 from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, absorbed_by_the_fit, meat, residual_noise
-from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, sensitivities
+from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, check_finite, sensitivities
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,10 @@ class Precision:
     __repr__ = __str__
 
 
+# Of the noise's variance, in the problem's.
+_LEAST_FACTOR = 1e-100
+
+
 def quantile_of(level: float) -> float:
     """Return the normal quantile of a two-sided interval.
 
@@ -92,7 +98,7 @@ def quantile_of(level: float) -> float:
         ValueError: unless the level is between 0 and 1.
 
     """
-    if not 0.0 < level < 1.0:
+    if not 0.0 < number("a confidence level between 0 and 1", level) < 1.0:
         raise ValueError(f"expected a confidence level between 0 and 1, such as 0.95, got {level!r}")
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
@@ -138,12 +144,12 @@ def linearised(
         expected: there are no residuals: the noise is white, of the problem's variance.
 
     Raises:
-        ValueError: for an unknown colour.
+        ValueError: for an unknown colour, or where the simulation or a derivative of it is not finite.
 
     """
-    if colour not in ("auto", "white", "coloured"):
-        raise ValueError(f"expected noise to be 'auto', 'white' or 'coloured', got {colour!r}")
+    one_of("noise", colour, ("auto", "white", "coloured"))
     found = sensitivities(problem, values)
+    check_finite(problem, found)
     noises, factor, curvature, words = None, 1.0, 1.0, "white, of the variance given"
     if not expected:
         noises, factor, curvature, words = _noise(problem, found, noise_variance_given, colour)
@@ -244,21 +250,33 @@ def _sentence(problem: Problem, noises: list[ResidualNoise], colour: str, source
         else:
             why = f"the residuals look white ({test})"
         return f"white, {source}: {why}"
-    period = float(np.max(problem.samples.sample_period))
+    period, samples = float(np.max(problem.samples.sample_period)), int(np.sum(problem.samples.measured))
     each = ", ".join(
-        f"{name}: autoregression of order {len(n.coefficients)}, {n.correlation_samples:.3g} samples "
-        f"({1e3 * period * n.correlation_samples:.3g} ms) tell as much as one"
-        for name, n in coloured
+        f"{name}: autoregression of order {len(n.coefficients)}, {_worth(n, period, samples)}" for name, n in coloured
     )
     why = "asked for" if colour == "coloured" else f"the residuals are correlated ({test})"
     return f"coloured, {source}: {why}; {each}"
 
 
+def _worth(noise: ResidualNoise, period: float, samples: int) -> str:
+    """Say how much samples with noise of that colour tell of a constant."""
+    together = noise.correlation_samples
+    if not together < samples:
+        return f"which all {samples} samples together do not average out"
+    if together < 1.0:
+        return f"whose swings cancel: of a constant one sample tells as much as {1.0 / together:.3g} with white noise"
+    return f"{together:.3g} samples ({1e3 * period * together:.3g} ms) tell as much as one"
+
+
 def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
     """Return what a person wants to know of a fit to first order."""
     found, noises, factor, _, words, covariance, seen = fit
-    directions = spectrum(parameter_root(found) / np.sqrt(factor))
+    # Data without any noise leave no residuals, and all directions that show are fixed.
+    directions = spectrum(parameter_root(found) / np.sqrt(max(factor, _LEAST_FACTOR)))
     count, names = len(found.names), list(found.names)
+    coloured = noises is not None and any(len(noise.coefficients) for noise in noises)
+    if coloured:
+        directions = of_covariance(directions, covariance[:count, :count])
     deviation = np.sqrt(np.diagonal(covariance))
     fixed = seen & (deviation <= NOT_FIXED)
     fixed[:count] &= ~taking_part_strongly(directions)
@@ -277,13 +295,13 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
             (names[i], names[j]): float(correlation[i, j]) for i in range(count) for j in range(i) if both[i, j]
         },
         covariance=np.where(both, parameters, np.nan),
-        combinations=combinations(found, directions),
+        combinations=combinations(found, directions, ~fixed[:count]),
         unfixed=unfixed_directions(problem, found, directions),
         initial_errors=tuple(
             {name: float(e) for name, e in zip(problem.free_initial, row, strict=True)} for row in by_record
         ),
         noise=words,
-        coloured=noises is not None and any(len(noise.coefficients) for noise in noises),
+        coloured=coloured,
         logarithmic=tuple(name for name in names if model.parameter(name).scale == "log"),
     )
 

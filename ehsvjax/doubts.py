@@ -1,0 +1,222 @@
+"""Fits that explain nothing, and what is likely behind it: signs, units, offsets, an unknown without effect.
+
+A simulation that fails is refused (`failure`): there is no fit. A model that explains nothing is a result with a
+warning, as it may be what the record says; only what was tried and would explain it is named.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit, at_bound
+from ehsvjax.models.model import Model
+from ehsvjax.population import Problem, cast, residuals
+from ehsvjax.record import Record
+from ehsvjax.simulate import grid_of, simulate
+from ehsvjax.unknowns import guess_noise_variance
+
+# Share of an output's variance below which a model explains nothing of it, and from which a change would explain it.
+_NOTHING, _MOST = 0.1, 0.5
+# Residuals of at most this many variances of white noise leave nothing to explain.
+_NOISE = 2.0
+# Integration steps between two samples over which what a model does is long over.
+_STEPS = 1000
+NO_CHANGE = 1e-6
+"""Changes of the sum of squares, in noise variances, that are none."""
+_DECADES = (1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4)
+# Slope of readings over simulated ones from which on their unit is another.
+_OTHER_UNIT = 1.5
+_NORMAL_MEDIAN = 0.6744897501960817
+
+
+def about_steps(model: Model, records: Sequence[Record]) -> tuple[str, ...]:
+    """Doubt records whose samples lie a thousand and more integration steps apart: milliseconds taken for seconds."""
+    return tuple(
+        f"{record.name} has a sample every {record.sample_period:.4g} s, {substeps} integration steps of "
+        f"{model.name} (max_step {model.max_step:.4g} s), which is slow and seldom meant: is its time in ms? Then use "
+        "time=Column(..., scale=1e-3), else a larger max_step"
+        for record in records
+        if (substeps := grid_of(model, record).substeps) > _STEPS
+    )
+
+
+def about_fit(
+    fit: Fit,
+    problem: Problem,
+    individual: Float[np.ndarray, " parameter"],
+    residual_variance: Float[np.ndarray, " signal"],
+    idle: Bool[np.ndarray, " parameter"],
+) -> tuple[str, ...]:
+    """Return what a user should know before trusting the numbers of a fit, each with what to do, the gravest first.
+
+    Args:
+        fit: whose own warnings are to be found.
+        problem: that was solved.
+        individual: the solution, in the unit cube.
+        residual_variance: of each observed output, unit squared.
+        idle: which unknowns change nothing near the solution.
+
+    """
+    return (
+        *_about_outputs(fit, dict(zip(problem.observed, residual_variance.tolist(), strict=True))),
+        *_about_unknowns(fit.model, problem, individual, idle),
+        *_about_search(fit.model, problem, individual, fit.effort),
+    )
+
+
+def _about_outputs(fit: Fit, residual_variance: Mapping[str, float]) -> tuple[str, ...]:
+    """Doubt a fit of whose outputs the model explains next to nothing, more than noise being there to explain."""
+    found = []
+    for name, left in residual_variance.items():
+        holding = [(r, start) for r, start in zip(fit.records, fit.initial, strict=True) if name in r.outputs]
+        readings = [record.outputs[name] for record, _ in holding]
+        share = 1.0 - left / _variance(readings, robust=fit.huber is not None)
+        noise = float(np.mean([guess_noise_variance(y) for y in readings]))
+        if share < _NOTHING and (left > _NOISE * noise or share < -_NOTHING):
+            record, start = max(holding, key=lambda pair: np.nanvar(pair[0].outputs[name]))
+            found.append(
+                f"{EXPLAINS_NOTHING} {name}: {_fit(share)}, where its mean alone has 0 %; "
+                + _what_would(fit.model, record, fit.parameters, start, name)
+            )
+    return tuple(found)
+
+
+def _about_unknowns(
+    model: Model,
+    problem: Problem,
+    individual: Float[np.ndarray, " parameter"],
+    suspected: Bool[np.ndarray, " parameter"],
+) -> tuple[str, ...]:
+    """Doubt suspected parameters whose whole range, the others held, changes no output."""
+    found = []
+    for i, name in enumerate(problem.free):
+        if suspected[i]:
+            rows = [np.where(np.arange(len(individual)) == i, place, individual) for place in (0.0, 0.5, 1.0)]
+            least, *others = (residuals_at(problem, row) for row in rows)
+            if all(np.sum((other - least) ** 2) < NO_CHANGE for other in others):
+                lower, upper, unit = (
+                    problem.coordinates.lower[i],
+                    problem.coordinates.upper[i],
+                    model.parameter(name).unit,
+                )
+                found.append(
+                    f"{name} changes nothing over all its bounds, {lower:.4g} .. {upper:.4g} {unit}".rstrip()
+                    + ": no output depends on it here; fix it, or use a record that excites what it does"
+                )
+    return tuple(found)
+
+
+def _about_search(model: Model, problem: Problem, individual, effort: Effort) -> tuple[str, ...]:
+    """Doubt what search and refinement left at a bound, unconverged or found once only."""
+    found = []
+    names = [*problem.free, *(n for _ in range(len(problem.samples.inputs)) for n in problem.free_initial)]
+    for name, place in zip(names, individual, strict=True):
+        if min(place, 1.0 - place) < 1e-6:
+            side = "lower" if place < 0.5 else "upper"
+            shown = name in problem.free or model.parameter(name).output in problem.observed
+            what = "" if shown else " (an initial condition, which this record may hardly show)"
+            found.append(at_bound(name, side, what))
+    if not effort.refined:
+        found.append("not refined: the parameters are as good as the search left them; use refine=True")
+    elif not effort.converged:
+        found.append(
+            "the refinement has not converged: a further step would lower the sum of squares by "
+            f"{effort.remaining:.2g} noise variances; perhaps the record does not fix every parameter"
+        )
+    if effort.refined and effort.starts > 1 and effort.starts_agreeing == 1:
+        found.append(
+            f"only one of {effort.starts} starts led to this minimum, there may be a better one: use a larger "
+            "population or more generations"
+        )
+    return tuple(found)
+
+
+def residuals_at(
+    problem: Problem, individual: Float[np.ndarray, " parameter"]
+) -> Float[np.ndarray, "record time signal"]:
+    """Return the standardised residuals of one individual of the unit cube, in float64."""
+    with jax.enable_x64(True):
+        return np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
+
+
+_residuals = jax.jit(residuals)
+
+
+def _variance(readings: Sequence[Float[np.ndarray, " time"]], robust: bool) -> float:
+    """Return the variance of readings about their mean in each record, or by their median distance from the median."""
+    if robust:
+        about = np.concatenate([np.abs(y - np.nanmedian(y)) for y in readings])
+        return float(np.nanmedian(about) / _NORMAL_MEDIAN) ** 2
+    return float(np.nanmean(np.concatenate([y - np.nanmean(y) for y in readings]) ** 2))
+
+
+def _fit(share: float) -> str:
+    percent = 100.0 * (1.0 - max(1.0 - share, 0.0) ** 0.5)
+    return "fit below -1000 %" if percent < -1000.0 else f"fit {percent:.{0 if abs(percent) >= 10.0 else 2}f} %"
+
+
+class _Trial(NamedTuple):
+    """What would explain an output, in words, and the share of its variance that it would."""
+
+    share: float
+    words: str
+
+
+def _what_would(model: Model, record: Record, parameters, start, name: str) -> str:
+    trials = list(_trials(model, record, parameters, start, name))
+    best = max(trials, key=lambda trial: round(trial.share, 2), default=None)
+    if best is not None and best.share > _MOST:
+        return f"{best.words} would give {_fit(best.share)}"
+    return (
+        f"no other sign, unit or offset alone explains it: look at the columns of {name} and "
+        f"{', '.join(model.inputs)}, at constants and at bounds"
+    )
+
+
+def _trials(model: Model, record: Record, parameters, start, name: str) -> Iterator[_Trial]:
+    """Yield single changes of sign, unit or offset, with the fitted and with the nominal values."""
+    unit, inputs = model.unit(name), ", ".join(model.inputs)
+    nominal = model.nominal, {p.name: p.value for p in model.initial}
+    for values, initial in ((parameters, start), nominal):
+        if grid_of(model, record).substeps <= _STEPS:
+            share, slope, offset = _straight(record, simulate(model, record, values, initial), name)
+            if slope < 0:
+                yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
+            elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
+                yield _Trial(share, f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})")
+            else:
+                yield _Trial(
+                    share, f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
+                )
+        for changed, words in _other_records(model, record, name):
+            share, slope, _ = _straight(changed, simulate(model, changed, values, initial), name)
+            if slope > 0:
+                yield _Trial(share, words)
+
+
+def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Record, str]]:
+    """Yield the record with another unit of time, and with other signs and units of the inputs, unless that is slow."""
+    yield replace(record, time=1e-3 * record.time), "a thousandth of the time (is it in ms?)"
+    for given in model.inputs if grid_of(model, record).substeps <= _STEPS else ():
+        values = record.inputs[given]
+        yield replace(record, inputs={**record.inputs, given: -values}), f"the opposite sign of {given}, or of {name},"
+        for factor in _DECADES:
+            changed = replace(record, inputs={**record.inputs, given: factor * values})
+            yield changed, f"{factor:g} times {given} (mind the unit of its column)"
+
+
+def _straight(record: Record, simulated, name: str) -> tuple[float, float, float]:
+    """Return the share of the variance that a straight line of the simulated output explains, its slope and offset."""
+    measured, x = record.outputs[name], simulated[name]
+    kept = np.isfinite(measured)
+    y, x = measured[kept], x[kept]
+    spread = float(np.var(x)) if np.isfinite(x).all() else 0.0
+    if not 0.0 < spread < np.inf:
+        return 0.0, 0.0, float(np.mean(y))
+    slope = float(np.mean((x - x.mean()) * (y - y.mean()))) / spread
+    return slope**2 * spread / float(np.var(y)), slope, float(np.mean(y) - slope * np.mean(x))
