@@ -16,6 +16,7 @@ from ehsvjax.simulate import simulate
 if TYPE_CHECKING:
     from jaxtyping import Array, Key
 
+    from ehsvjax.effects import Effect
     from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
     from ehsvjax.precision.of_fit import Prepared
 
@@ -341,26 +342,35 @@ class Fit:
         return summary_html(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the fit, its records included, to one NPZ file without pickled content."""
+        """Write the fit, its records included, to one NPZ file without pickled content, whole or not at all.
+
+        Raises:
+            OSError: if it cannot be written; a file that was there stays as it was.
+
+        """
         from ehsvjax.storage import save_fit
 
         save_fit(self, path)
 
     @staticmethod
-    def load(path: str | os.PathLike, model: Model | None = None) -> "Fit":
+    def load(path: str | os.PathLike, model: Model | None = None, bank: "Sequence[Effect] | None" = None) -> "Fit":
         """Read a fit that `save` wrote.
 
         Args:
             path: the file.
-            model: needed for a model of your own, as equations are not stored; those of this package are made again.
+            model: needed for a model of your own, as equations are not stored, with or without the effects that the
+                fitted one was extended by; those of this package are made again.
+            bank: needed for an effect of your own, `(*ehsvjax.effects.BANK, my_effect)`.
 
         Raises:
-            ValueError: if the file holds no fit, or the model does not have the stored parameters.
+            ValueError: if the file holds no fit, was altered, or needs a model or an effect that was not handed over.
+            OSError: if the file is not there or may not be read.
 
         """
+        from ehsvjax.effects import BANK
         from ehsvjax.storage import load_fit
 
-        return load_fit(path, model)
+        return load_fit(path, model, BANK if bank is None else bank)
 
 
 def _score(records: Sequence[Record], residuals: Sequence[Mapping[str, Float[np.ndarray, " time"]]]) -> Score:
