@@ -69,6 +69,12 @@ def read_sealed(path: str | os.PathLike, kind: str, what: str, remedy: str) -> S
     """
     with reading(path, what, remedy):
         everything = read_arrays(path)
+    if not {_CONTENT, _SEAL} <= set(everything):
+        raise ValueError(
+            f"expected {what} at {path}, got a file of an older version of ehsvjax, or another one (it holds "
+            f"{', '.join(everything) or 'nothing'}): {remedy}"
+        )
+    with reading(path, what, remedy):
         text = everything[_CONTENT].tobytes().decode()
         header = json.loads(text)
         found, version, facts = header["kind"], header["version"], header["facts"]

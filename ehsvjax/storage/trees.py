@@ -6,6 +6,7 @@ that hold the same record hold one record again when they are read.
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -86,10 +87,8 @@ def _described(value: Any, tree: Tree, encoded: Callable) -> dict[str, Any]:
         return {"effect": describe_effect(value)}
     kind = type(value)
     if kind.__module__.startswith(f"{_PACKAGE}.") and (fields := _fields(kind)):
-        return {
-            "type": [kind.__module__, kind.__qualname__],
-            "fields": {name: encoded(getattr(value, name)) for name in fields},
-        }
+        contents = {name: encoded(getattr(value, name)) for name in fields}
+        return {"result": {"type": [kind.__module__, kind.__qualname__], "fields": contents}}
     if _is_frame(value):
         return {"frame": _described_frame(value, encoded)}
     if isinstance(value, np.ndarray | np.generic) or hasattr(value, "__array__"):
@@ -131,36 +130,31 @@ def _made(
     bank: Sequence[Effect],
 ) -> Any:
     """Return one listed object, made of those before it."""
+    decoded = functools.partial(_decoded, made)
+    ((form, content),) = one.items()
+    if form == "model":
+        return find_model(content, decoded, model)
+    if form == "effect":
+        return find_effect(content, bank)
+    if form == "result":
+        return _result(content["type"], {name: decoded(value) for name, value in content["fields"].items()})
+    if form == "frame":
+        return _frame(content["columns"], content["index"], decoded)
+    array = arrays[content]
+    return array[()] if form == "scalar" else array
 
-    def decoded(value):
-        if not isinstance(value, dict):
-            return value
-        ((form, content),) = value.items()
-        match form:
-            case "object":
-                return made[content]
-            case "list":
-                return [decoded(v) for v in content]
-            case "tuple":
-                return tuple(decoded(v) for v in content)
-            case "dict":
-                return {decoded(k): decoded(v) for k, v in content}
-        raise KeyError(form)
 
-    match one:
-        case {"model": described}:
-            return find_model(described, decoded, model)
-        case {"effect": described}:
-            return find_effect(described, bank)
-        case {"type": [module, name], "fields": fields}:
-            return _instance(module, name, {key: decoded(v) for key, v in fields.items()})
-        case {"frame": {"columns": columns, "index": index}}:
-            return _frame(columns, index, decoded)
-        case {"array": name}:
-            return arrays[name]
-        case {"scalar": name}:
-            return arrays[name][()]
-    raise KeyError(", ".join(one))
+def _decoded(made: Sequence[Any], value: Any) -> Any:
+    """Return a value from its JSON form."""
+    if not isinstance(value, dict):
+        return value
+    ((form, content),) = value.items()
+    if form == "object":
+        return made[content]
+    if form == "dict":
+        return {_decoded(made, k): _decoded(made, v) for k, v in content}
+    items = [_decoded(made, v) for v in content]
+    return tuple(items) if form == "tuple" else items
 
 
 def _frame(columns, index, decoded: Callable) -> Any:
@@ -170,9 +164,9 @@ def _frame(columns, index, decoded: Callable) -> Any:
     return pd.DataFrame({name: pd.Series(decoded(v), dtype=dtype, index=rows) for name, v, dtype in columns}, rows)
 
 
-def _instance(module: str, name: str, fields: dict[str, Any]) -> Any:
+def _result(kind: tuple[str, str], fields: dict[str, Any]) -> Any:
     """Return a NamedTuple or a dataclass of this package; nothing else is ever made."""
-    found = None
+    (module, name), found = kind, None
     if module.startswith(f"{_PACKAGE}."):
         with contextlib.suppress(ImportError):
             found = getattr(importlib.import_module(module), name, None)
