@@ -63,8 +63,8 @@ def reading(path: str | os.PathLike, what: str, remedy: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        # The system's own sentence names the file; a library's, of what it found in it, has no number.
-        if error.errno is not None:
+        # Where the system does not open a file it names it; elsewhere a library was led astray by what is in it.
+        if error.filename is not None:
             raise
         raise ValueError(_sentence(path, what, error, remedy)) from error
     except Exception as error:

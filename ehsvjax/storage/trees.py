@@ -164,7 +164,7 @@ def _frame(columns, index, decoded: Callable) -> Any:
     return pd.DataFrame({name: pd.Series(decoded(v), dtype=dtype, index=rows) for name, v, dtype in columns}, rows)
 
 
-def _result(kind: tuple[str, str], fields: dict[str, Any]) -> Any:
+def _result(kind: Sequence[str], fields: dict[str, Any]) -> Any:
     """Return a NamedTuple or a dataclass of this package; nothing else is ever made."""
     (module, name), found = kind, None
     if module.startswith(f"{_PACKAGE}."):
