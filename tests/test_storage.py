@@ -105,11 +105,18 @@ def test_a_model_of_your_own_is_handed_over(tmp_path):
         Fit.load(tmp_path / "fit", ehsvjax.van_der_pol())
 
 
-def test_a_model_that_only_bears_the_name_of_one_of_the_package_is_not_taken_for_it(tmp_path):
-    def derivative(parameters, state, inputs, signal):
-        return {"x1": parameters["alpha"] * state["x2"], "x2": -state["x1"] + parameters["gamma"] * inputs["command"]}
+def _own_oscillator():
+    """Return a model that bears the name of one of the package."""
 
-    own = replace(ehsvjax.van_der_pol(), stepper=ehsvjax.runge_kutta_4(derivative))
+    def derivative(parameters, state, inputs, signal):
+        force = signal("force", parameters["gamma"] * inputs["command"], position=state["x1"], velocity=state["x2"])
+        return {"x1": parameters["alpha"] * state["x2"], "x2": force - state["x1"]}
+
+    return replace(ehsvjax.van_der_pol(), stepper=ehsvjax.runge_kutta_4(derivative))
+
+
+def test_a_model_that_only_bears_the_name_of_one_of_the_package_is_not_taken_for_it(tmp_path):
+    own = _own_oscillator()
     _fit_of(own).save(tmp_path / "fit")
     with pytest.raises(ValueError, match="not of this package"):
         Fit.load(tmp_path / "fit")
@@ -118,7 +125,7 @@ def test_a_model_that_only_bears_the_name_of_one_of_the_package_is_not_taken_for
 
 @pytest.mark.parametrize("own_model", [False, True])
 def test_an_effect_of_your_own_is_handed_over(own_model, tmp_path):
-    base = replace(ehsvjax.van_der_pol(), stepper=lambda *a: hand_made._stepper(*a)) if own_model else None
+    base = _own_oscillator() if own_model else None
     bank = (*BANK, OWN)
     model = _attached(base or ehsvjax.van_der_pol(), {"suction.size": (0.0, 1.0)}, bank)
     fit = _fit_of(model)
