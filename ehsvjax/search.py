@@ -90,15 +90,16 @@ def _run(
 
     The history of the generations that were run is gathered here, so that its size is theirs.
     """
-    mark, pieces = "", [_since(recent, 0, 0)]
+    mark, pieces, done = "", list[History](), 0
     if checkpoint is not None:
         mark = _fingerprint(cost, operators, state, generations, tolerance)
-        state, pieces[0] = _restore(Path(checkpoint), mark, (state, pieces[0]))
+        if Path(checkpoint).exists():
+            state, history = _restore(Path(checkpoint), mark, state)
+            pieces, done = [history], _generation(state)
     watched = progress or checkpoint is not None
     # Processes that share a search have to make the same calls, whatever their clocks say.
     timed = not watched and jax.process_count() == 1
     stride = 1 if watched or timed else len(recent.best_cost)
-    done = _generation(state)
     bar = _bar(generations, done) if progress else None
     with bar or contextlib.nullcontext():
         while done < generations and not np.ravel(state.converged)[0]:
@@ -221,10 +222,8 @@ def _store(path: Path, mark: str, both: tuple[State, History]) -> None:
     write_sealed(path, "checkpoint", {"fingerprint": mark}, arrays, compressed=False)
 
 
-def _restore(path: Path, mark: str, fresh: tuple[State, History]) -> tuple[State, History]:
-    """Return what the checkpoint holds, or the fresh start where there is none."""
-    if not path.exists():
-        return fresh
+def _restore(path: Path, mark: str, fresh: State) -> tuple[State, History]:
+    """Return what the checkpoint holds."""
     sealed = read_sealed(path, "checkpoint", "a checkpoint of a search", "remove it or name a new one")
     if sealed.facts["fingerprint"] != mark:
         raise ValueError(
@@ -233,4 +232,4 @@ def _restore(path: Path, mark: str, fresh: tuple[State, History]) -> tuple[State
         )
     raw: dict[str, Any] = {name: jnp.asarray(sealed.arrays[f"state/{name}"]) for name in State._fields}
     history: dict[str, Any] = {name: sealed.arrays[f"history/{name}"] for name in History._fields}
-    return _with_key(State(**raw), fresh[0].key), History(**history)
+    return _with_key(State(**raw), fresh.key), History(**history)
