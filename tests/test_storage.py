@@ -1,6 +1,7 @@
 """Fits and diagnoses come back whole, in another process too; what cannot come back says why."""
 
 import base64
+import inspect
 import json
 import os
 import re
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax import Fit, Record
+from ehsvjax import Fit, Record, storage
 from ehsvjax.diagnose import Diagnosis
 from ehsvjax.effects import BANK, Effect, amplitude, attach, effects_of
 from ehsvjax.effects.effect import constant
@@ -218,7 +219,12 @@ def test_what_is_no_fit_says_so(tmp_path):
             Fit.load(path)
 
 
-# --- diagnoses
+@pytest.mark.parametrize("handed", [{"model": "servovalve"}, {"bank": 3}, {"bank": ["sensor_bias"]}])
+def test_what_is_no_model_or_no_effect_is_refused(handed, tmp_path):
+    hand_made.fit().save(tmp_path / "fit")
+    for load in (storage.load_fit, storage.load_diagnosis):
+        with pytest.raises(ValueError, match=r"expected (the model that was fitted|bank to hold effects), .* got"):
+            inspect.unwrap(load)(tmp_path / "fit", **handed)
 
 
 PROCESS = """

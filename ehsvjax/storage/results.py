@@ -1,7 +1,7 @@
 """A fit or a diagnosis, saved and loaded."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ehsvjax.effects import BANK
@@ -31,6 +31,7 @@ def load_fit(path: str | os.PathLike, model: Model | None = None, bank: Sequence
         OSError: if the file is not there or may not be read.
 
     """
+    _check_handed(model, bank)
     if version_1.is_version_1(path):
         return version_1.load_fit(path, model)
     return _load(path, Fit, "a fit written by Fit.save", model, bank)
@@ -51,6 +52,7 @@ def load_diagnosis(path: str | os.PathLike, model: Model | None = None, bank: Se
     """
     from ehsvjax.diagnose.diagnosis import Diagnosis
 
+    _check_handed(model, bank)
     return _load(path, Diagnosis, "a diagnosis written by Diagnosis.save", model, bank)
 
 
@@ -59,10 +61,17 @@ def _save(result: Any, path: str | os.PathLike) -> None:
     write_sealed(path, type(result).__name__, {"objects": tree.objects}, tree.arrays)
 
 
+def _check_handed(model: Any, bank: Any) -> None:
+    if model is not None and not isinstance(model, Model):
+        raise ValueError(f"expected the model that was fitted, or none for one of this package, got {model!r}")
+    if not isinstance(bank, Iterable) or not all(isinstance(effect, Effect) for effect in bank):
+        raise ValueError(f"expected bank to hold effects, (*ehsvjax.effects.BANK, my_effect), got {bank!r}")
+
+
 def _load(path: str | os.PathLike, kind: type, what: str, model: Model | None, bank: Sequence[Effect]) -> Any:
     sealed = read_sealed(path, kind.__name__, what, _DAMAGED)
     try:
-        result = from_tree(Tree(sealed.facts["objects"], sealed.arrays), model, tuple(bank))
+        result = from_tree(Tree(sealed.facts["objects"], sealed.arrays), model, bank)
     except ValueError as error:
         raise ValueError(f"expected {what} at {path} that this program can put together, got {error}") from error
     except Exception as error:
