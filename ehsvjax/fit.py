@@ -19,6 +19,7 @@ from ehsvjax.simulate import simulate
 if TYPE_CHECKING:
     from jaxtyping import Array, Key
 
+    from ehsvjax.effects import Effect
     from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
     from ehsvjax.precision.of_fit import Prepared
 
@@ -64,8 +65,8 @@ class Effort(NamedTuple):
         starts_agreeing: how many of them led to the same minimum.
         converged: whether the refinement has, by its own test; without refinement, whether the search's stop test has.
         remaining: noise variances by which another step would still lower the sum of squares, to first order.
-        step_size: of the integration, s: the model's `max_step`, or what the arithmetic needed.
-        arithmetic: noise variances by which the error of integration is off in the sum of squares.
+        step_size: of the integration, s: the model's `max_step`, or what the arithmetic needed; None if unknown.
+        arithmetic: noise variances that the error of integration is worth; None if it was not measured.
         left_out: readings that no useful step knows, such as those beside a jump of a pressure: they carry no weight.
 
     """
@@ -80,8 +81,8 @@ class Effort(NamedTuple):
     starts_agreeing: int
     converged: bool
     remaining: float
-    step_size: float = float("nan")
-    arithmetic: float = float("nan")
+    step_size: float | None = None
+    arithmetic: float | None = None
     left_out: int = 0
 
 
@@ -359,26 +360,35 @@ class Fit:
         return summary_html(self)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the fit, its records included, to one NPZ file without pickled content."""
+        """Write the fit, its records included, to one NPZ file without pickled content, whole or not at all.
+
+        Raises:
+            OSError: if it cannot be written; a file that was there stays as it was.
+
+        """
         from ehsvjax.storage import save_fit
 
         save_fit(self, path)
 
     @staticmethod
-    def load(path: str | os.PathLike, model: Model | None = None) -> "Fit":
+    def load(path: str | os.PathLike, model: Model | None = None, bank: "Sequence[Effect] | None" = None) -> "Fit":
         """Read a fit that `save` wrote.
 
         Args:
             path: the file.
-            model: needed for a model of your own, as equations are not stored; those of this package are made again.
+            model: needed for a model of your own, as equations are not stored, with or without the effects that the
+                fitted one was extended by; those of this package are made again.
+            bank: needed for an effect of your own, `(*ehsvjax.effects.BANK, my_effect)`.
 
         Raises:
-            ValueError: if the file holds no fit, or the model does not have the stored parameters.
+            ValueError: if the file holds no fit, was altered, or needs a model or an effect that was not handed over.
+            OSError: if the file is not there or may not be read.
 
         """
+        from ehsvjax.effects import BANK
         from ehsvjax.storage import load_fit
 
-        return load_fit(path, model)
+        return load_fit(path, model, BANK if bank is None else bank)
 
 
 def checked_record(record) -> Record:

@@ -71,6 +71,8 @@ class State(NamedTuple):
 class History(NamedTuple):
     """What a person wants to see of each generation; NaN for those not reached.
 
+    On the device it may be shorter than the run: generation k stands at k modulo its length.
+
     Attributes:
         best_cost: of the best so far.
         median_cost: of the generation, failed simulations counted as +inf.
@@ -152,7 +154,7 @@ def generation(
     )
 
 
-@functools.partial(jax.jit, static_argnames="operators")
+@functools.partial(jax.jit, static_argnames=("operators", "generations"))
 def run(
     cost: Callable,
     operators: Operators,
@@ -160,6 +162,7 @@ def run(
     history: History,
     until: int | Int[Array, ""],
     tolerance: float | Float[Array, ""],
+    generations: int | None = None,
 ) -> tuple[State, History]:
     """Run up to generation `until`, or until the stop test is passed: one compiled call, simulation included.
 
@@ -170,12 +173,14 @@ def run(
             without compiling again.
         operators: the operators, static.
         state: from `init`, or from an earlier call.
-        history: likewise; its length is the number of generations.
-        until: the generation to stop at, at most that length.
+        history: likewise; of a shorter one than the run the last generations stay.
+        until: the generation to stop at, at most the number of generations.
         tolerance: of the stop test, see `generation`.
+        generations: how many there will be at most, static; by default the history's length.
 
     """
-    generations = len(history.best_cost)
+    length = len(history.best_cost)
+    generations = length if generations is None else generations
 
     def unfinished(both):
         state, _ = both
@@ -183,7 +188,7 @@ def run(
 
     def body(both):
         state, history = both
-        k = state.generation
+        k = state.generation % length
         state = generation(cost, operators, state, generations, tolerance)
         return state, History(
             best_cost=history.best_cost.at[k].set(state.elite_cost[0]),

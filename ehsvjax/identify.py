@@ -25,7 +25,7 @@ from ehsvjax.population import Problem, cast, population_cost, shared_cost, to_u
 from ehsvjax.record import Record
 from ehsvjax.refine import Refined
 from ehsvjax.refine import refine as refine_starts
-from ehsvjax.search import search
+from ehsvjax.search import check_sizes, search
 from ehsvjax.unknowns import Initial, problem_of, where_to_search
 
 DEFAULT_OPERATORS = Operators()
@@ -99,6 +99,7 @@ def identify(
     cost = population_cost if devices is None or islands > 1 else shared_cost(devices)
     model = model.with_bounds(bounds, fixed)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
+    check_sizes(population, generations, operators, islands, problem.unknowns)
     begin = replace(problem, coordinates=where_to_search(model, records, problem))
     slow = doubts.about_steps(model, records)
     for doubt in slow:

@@ -33,7 +33,7 @@ def init(
     return states, jax.tree.map(lambda leaf: leaf[0], histories)
 
 
-@functools.partial(jax.jit, static_argnames=("operators", "devices"))
+@functools.partial(jax.jit, static_argnames=("operators", "generations", "devices"))
 def run(
     cost: Callable,
     operators: Operators,
@@ -41,13 +41,14 @@ def run(
     history: History,
     until: int | Int[Array, ""],
     tolerance: float | Float[Array, ""],
+    generations: int | None = None,
     *,
     devices: tuple[jax.Device, ...],
 ) -> tuple[State, History]:
     """Run every island up to generation `until`, or until each has passed the stop test: one compiled call.
 
     Args:
-        cost, operators, until, tolerance: as for `genetic.run`.
+        cost, operators, until, tolerance, generations: as for `genetic.run`.
         state: `[island, ...]`, from `init` or from an earlier call.
         history: of all islands together.
         devices: those that share the islands, as many for each.
@@ -59,9 +60,10 @@ def run(
     islands = len(state.generation)
     if islands % len(devices):
         raise ValueError(f"expected as many islands on each of {len(devices)} devices, got {islands} in all")
+    most = len(history.best_cost) if generations is None else generations
     mesh, shared, alike = Mesh(np.array(devices), ("island",)), PartitionSpec("island"), PartitionSpec()
     state, history = jax.shard_map(
-        functools.partial(_run_here, operators, len(devices)),
+        functools.partial(_run_here, operators, most, len(devices)),
         mesh=mesh,
         in_specs=(alike, shared, alike, alike, alike),
         out_specs=(shared, alike),
@@ -90,9 +92,10 @@ def merged(state: State, elites: int) -> State:
     )
 
 
-def _run_here(operators: Operators, device_count: int, cost, state: State, history: History, until, tolerance):
+def _run_here(
+    operators: Operators, generations: int, device_count: int, cost, state: State, history: History, until, tolerance
+):
     """Run the islands of one device; every device takes part in every generation."""
-    generations = len(history.best_cost)
 
     def unfinished(both):
         state, _ = both
@@ -110,7 +113,7 @@ def _run_here(operators: Operators, device_count: int, cost, state: State, histo
             candidates=jnp.where(migration, settled, state.candidates),
             converged=jnp.full_like(state.converged, everywhere),
         )
-        return state, _recorded(state, history, k)
+        return state, _recorded(state, history, k % len(history.best_cost))
 
     return lax.while_loop(unfinished, body, (state, history))
 

@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 import ehsvjax.paper as paper
+from ehsvjax.files import written_whole
 from ehsvjax.models import Model, servovalve, van_der_pol
 from ehsvjax.paper import Identification
 from ehsvjax.plots import embedded, plot_identification, plot_pressure_flow, to_png
@@ -55,13 +56,18 @@ def write_report(
     )
     out.mkdir(parents=True, exist_ok=True)
     for name, picture in pictures.items():
-        (out / f"{name}.png").write_bytes(picture)
+        _write(out / f"{name}.png", picture)
     for name, table in (("table_1", table_1), ("table_2", table_2)):
         flat = table.set_axis([" ".join(column) for column in table.columns], axis="columns")
-        flat.to_csv(out / f"{name}.csv", float_format="%.6g")
+        _write(out / f"{name}.csv", flat.to_csv(float_format="%.6g").encode())
     report = out / "report.html"
-    report.write_text(page, encoding="utf-8")
+    _write(report, page.encode())
     return report
+
+
+def _write(path: Path, content: bytes) -> None:
+    with written_whole(path) as file:
+        file.write(content)
 
 
 def _identification_figure(identifications: Sequence[Identification]):

@@ -1,10 +1,9 @@
-"""The genetic search as a person runs it: one compiled call, or generation by generation with a bar or a checkpoint."""
+"""The genetic search as a person runs it: in calls of half a second, or by generations with a bar or a checkpoint."""
 
+import contextlib
 import functools
-import hashlib
 import os
-import re
-import zipfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,16 @@ from jaxtyping import Array, Key
 
 from ehsvjax import genetic
 from ehsvjax import islands as archipelago
+from ehsvjax.fingerprint import fingerprint
 from ehsvjax.genetic import History, Operators, State
+from ehsvjax.sealed import read_sealed, write_sealed
+
+# Of one compiled call, s: an interrupt is heard between two.
+_PATIENCE = 0.5
+# Generations whose history is on the device: longer runs bring it home piece by piece.
+_REMEMBERED = 1024
+# What a generation holds of each individual at least: coordinates of candidates, population, parents and children.
+_COPIES = 5
 
 
 def search(
@@ -51,17 +59,20 @@ def search(
 
     Raises:
         ValueError: for sizes that cannot be, or a checkpoint of another search.
+        OSError: if the checkpoint cannot be read or written.
 
     """
-    _check_sizes(population, generations, operators, islands)
+    check_sizes(population, generations, operators, islands, unknowns)
     key = jax.random.wrap_key_data(key) if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else key
+    remembered = min(generations, _REMEMBERED)
     if islands == 1:
-        state, history = genetic.init(key, population, unknowns, generations, operators.elites)
-        return _run(genetic.run, cost, operators, state, history, tolerance, progress, checkpoint)
-    state, history = archipelago.init(key, islands, population, unknowns, generations, operators.elites)
-    run = functools.partial(archipelago.run, devices=tuple(devices or jax.devices()[:1]))
-    state, history = _run(run, cost, operators, state, history, tolerance, progress, checkpoint)
-    return archipelago.merged(state, operators.elites), history
+        run: Callable = genetic.run
+        state, recent = genetic.init(key, population, unknowns, remembered, operators.elites)
+    else:
+        run = functools.partial(archipelago.run, devices=tuple(devices or jax.devices()[:1]))
+        state, recent = archipelago.init(key, islands, population, unknowns, remembered, operators.elites)
+    state, history = _run(run, cost, operators, state, recent, generations, tolerance, progress, checkpoint)
+    return (state if islands == 1 else archipelago.merged(state, operators.elites)), history
 
 
 def _run(
@@ -69,31 +80,59 @@ def _run(
     cost: Callable,
     operators: Operators,
     state: State,
-    history: History,
+    recent: History,
+    generations: int,
     tolerance: float,
     progress: bool,
     checkpoint: str | os.PathLike | None,
 ) -> tuple[State, History]:
-    """Run to the end in one call, or generation by generation."""
-    generations = len(history.best_cost)
-    if checkpoint is None and not progress:
-        return _at_home(run(cost, operators, state, history, generations, tolerance))
+    """Run to the end, in calls of some generations; with a bar or a checkpoint one by one.
 
-    mark = ""
+    The history of the generations that were run is gathered here, so that its size is theirs.
+    """
+    mark, pieces, done = "", list[History](), 0
     if checkpoint is not None:
         mark = _fingerprint(cost, operators, state, generations, tolerance)
-        state, history = _restore(Path(checkpoint), mark, (state, history))
-    # Every island has come to the same generation, and they stop together.
-    done = int(np.ravel(state.generation)[0])
-    with _bar(progress, generations, done) as bar:
+        if Path(checkpoint).exists():
+            state, history = _restore(Path(checkpoint), mark, state)
+            pieces, done = [history], _generation(state)
+    watched = progress or checkpoint is not None
+    # Processes that share a search have to make the same calls, whatever their clocks say.
+    timed = not watched and jax.process_count() == 1
+    stride = 1 if watched or timed else len(recent.best_cost)
+    bar = _bar(generations, done) if progress else None
+    with bar or contextlib.nullcontext():
         while done < generations and not np.ravel(state.converged)[0]:
-            done += 1
-            state, history = _at_home(run(cost, operators, state, history, done, tolerance))
+            began, before = time.monotonic(), done
+            until = min(done + stride, generations)
+            state, recent = _at_home(run(cost, operators, state, recent, until, tolerance, generations))
+            done = _generation(state)
+            pieces.append(_since(recent, before, done))
             if checkpoint is not None:
-                _store(Path(checkpoint), mark, (state, history))
-            bar.set_postfix(cost=f"{float(history.best_cost[done - 1]):.6g}", refresh=False)
-            bar.update()
-    return state, history
+                pieces = [_joined(pieces)]
+                _store(Path(checkpoint), mark, (state, pieces[0]))
+            if bar is not None:
+                bar.set_postfix(cost=f"{float(pieces[-1].best_cost[-1]):.6g}", refresh=False)
+                bar.update(done - before)
+            if timed:
+                rate = (done - before) / max(time.monotonic() - began, 1e-9)
+                stride = min(max(int(_PATIENCE * rate), 1), len(recent.best_cost))
+    return state, _joined(pieces)
+
+
+def _generation(state: State) -> int:
+    """Return how many generations were evaluated: every island has come to the same one."""
+    return int(np.ravel(state.generation)[0])
+
+
+def _since(recent: History, first: int, done: int) -> History:
+    """Return the history from one generation up to another, of those that are remembered."""
+    places = np.arange(first, done) % len(recent.best_cost)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[places], recent)
+
+
+def _joined(pieces: Sequence[History]) -> History:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
 
 
 def _at_home(both: tuple[State, History]) -> tuple[State, History]:
@@ -104,16 +143,29 @@ def _at_home(both: tuple[State, History]) -> tuple[State, History]:
     def local(leaf):
         return jnp.asarray(np.asarray(leaf if leaf.is_fully_addressable else process_allgather(leaf, tiled=True)))
 
-    return _with_key(jax.tree.map(local, _raw(both)), both[0].key)
+    state, history = both
+    raw, history = jax.tree.map(local, (_raw(state), history))
+    return _with_key(raw, state.key), history
 
 
-def _with_key(raw: tuple[State, History], like: Key[Array, "*island"]) -> tuple[State, History]:
+def _raw(state: State) -> State:
+    """Return the state with its random key as plain numbers."""
+    return state._replace(key=jax.random.key_data(state.key))
+
+
+def _with_key(raw: State, like: Key[Array, "*island"]) -> State:
     """Return a state whose random key is plain numbers with the key made again."""
-    state, history = raw
-    return state._replace(key=jax.random.wrap_key_data(state.key, impl=jax.random.key_impl(like))), history
+    return raw._replace(key=jax.random.wrap_key_data(raw.key, impl=jax.random.key_impl(like)))
 
 
-def _check_sizes(population: int, generations: int, operators: Operators, islands: int) -> None:
+def check_sizes(population: int, generations: int, operators: Operators, islands: int, unknowns: int) -> None:
+    """Refuse sizes of a search that cannot be; arguments as for `search`.
+
+    Raises:
+        ValueError: if one is no whole number or too small, if elite or immigrants fill the population, or if the
+            machine's memory could not hold what would be in it at once.
+
+    """
     sizes = (("population", population, 4), ("generations", generations, 1), ("islands", islands, 1))
     for name, value, least in sizes:
         if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
@@ -122,73 +174,62 @@ def _check_sizes(population: int, generations: int, operators: Operators, island
         raise ValueError(f"expected 1 to {population - 1} elites (fewer than the population), got {operators.elites}")
     if not 0 <= operators.immigrants < 1:
         raise ValueError(f"expected immigrants to be a share of the population from 0 to 1, got {operators.immigrants}")
+    number = np.dtype(np.float32).itemsize
+    needed = {
+        f"population={population} on islands={islands}": number * int(population) * int(islands) * unknowns * _COPIES,
+        f"generations={generations}": number * int(generations) * (len(History._fields) - 1 + unknowns),
+    }
+    memory = _memory()
+    for what, size in needed.items():
+        if size > memory:
+            raise ValueError(
+                f"expected a search that fits into this machine's memory of {memory / 1e9:.3g} GB, got {what}, which "
+                f"takes {size / 1e9:.3g} GB for {unknowns} unknowns: take fewer"
+            )
+    if generations > np.iinfo(np.int32).max:
+        raise ValueError(f"expected at most {np.iinfo(np.int32).max} generations, got {generations}")
 
 
-def _bar(shown: bool, generations: int, done: int):
+def _memory() -> float:
+    """Return the memory of this machine in bytes; +inf where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return float("inf")
+
+
+def _bar(generations: int, done: int):
     from tqdm.auto import tqdm
 
-    return tqdm(total=generations, initial=done, desc="generations", unit="gen", disable=not shown)
+    return tqdm(total=generations, initial=done, desc="generations", unit="gen")
 
 
 def _fingerprint(cost: Callable, operators: Operators, state: State, generations: int, tolerance: float) -> str:
-    """Return a digest of all that a search depends on, the same in every process."""
-    digest = hashlib.sha256()
-    leaves, structure = jax.tree.flatten((cost, _raw(state)))
-    for leaf in leaves:
-        array = np.asarray(leaf)
-        digest.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
-    digest.update(repr((_describe(operators), generations, tolerance, _no_addresses(str(structure)))).encode())
-    return digest.hexdigest()
+    """Return a digest of all that a search depends on, the same in every process: of what a generation computes."""
 
+    def one_generation(cost, state, generations, tolerance):
+        one = jax.tree.map(lambda leaf: leaf[0], state) if state.generation.ndim else state
+        return genetic.generation(cost, operators, one, generations, tolerance)
 
-def _describe(value) -> str:
-    """Return what a setting says, for functions their name and what they close over instead of their address."""
-    if isinstance(value, tuple):
-        return repr([_describe(v) for v in value])
-    if callable(value):
-        cells = [_describe(cell.cell_contents) for cell in getattr(value, "__closure__", None) or ()]
-        return f"{value.__module__}.{value.__qualname__}{cells}"
-    return repr(value)
-
-
-def _no_addresses(text: str) -> str:
-    return re.sub(r" at 0x[0-9a-f]+", "", text)
-
-
-def _raw(tree):
-    """Return the tree with random keys as plain numbers."""
-
-    def plain(leaf):
-        return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-
-    return jax.tree.map(plain, tree)
+    return fingerprint(one_generation, cost, state, int(generations), float(tolerance))
 
 
 def _store(path: Path, mark: str, both: tuple[State, History]) -> None:
-    """Write beside the file and rename: a kill at any moment leaves a whole file, the old one or the new."""
-    beside = path.with_name(path.name + ".writing")
-    leaves = jax.tree.leaves(_raw(both))
-    with open(beside, "wb") as file:
-        arrays: dict[str, Any] = {f"leaf_{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
-        np.savez(file, fingerprint=np.array(mark), **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(beside, path)
+    """Write what has been done so far: a kill at any moment leaves a whole file, the old one or the new."""
+    state, history = both
+    arrays = {f"state/{name}": np.asarray(leaf) for name, leaf in _raw(state)._asdict().items()}
+    arrays |= {f"history/{name}": leaf for name, leaf in history._asdict().items()}
+    write_sealed(path, "checkpoint", {"fingerprint": mark}, arrays, compressed=False)
 
 
-def _restore(path: Path, mark: str, fresh: tuple[State, History]) -> tuple[State, History]:
-    """Return what the checkpoint holds, or the fresh start where there is none."""
-    if not path.exists():
-        return fresh
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            stored = str(file["fingerprint"])
-            leaves = [jnp.asarray(file[f"leaf_{i}"]) for i in range(len(file.files) - 1)]
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise ValueError(f"expected a checkpoint of a search at {path}, got another file: name a new one") from error
-    if stored != mark:
+def _restore(path: Path, mark: str, fresh: State) -> tuple[State, History]:
+    """Return what the checkpoint holds."""
+    sealed = read_sealed(path, "checkpoint", "a checkpoint of a search", "remove it or name a new one")
+    if sealed.facts["fingerprint"] != mark:
         raise ValueError(
-            f"expected {path} to be the checkpoint of this search, got one of another (other data, model, key, "
-            "sizes or operators): remove it or name a new one"
+            f"expected {path} to be the checkpoint of this search, got one of another (other data, model, key, sizes, "
+            "operators or devices, or another version of ehsvjax or JAX): remove it or name a new one"
         )
-    return _with_key(jax.tree.unflatten(jax.tree.structure(_raw(fresh)), leaves), fresh[0].key)
+    raw: dict[str, Any] = {name: jnp.asarray(sealed.arrays[f"state/{name}"]) for name in State._fields}
+    history: dict[str, Any] = {name: sealed.arrays[f"history/{name}"] for name in History._fields}
+    return _with_key(State(**raw), fresh.key), History(**history)

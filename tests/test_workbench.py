@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose.curves import bench_with, outputs_with, quantities, straight_along
+from ehsvjax.diagnose.curves import bench_with, outputs_with, probe_at, quantities, straight_along
 from ehsvjax.diagnose.noise import plain_noise
 from ehsvjax.diagnose.refits import padded, refit
 from ehsvjax.diagnose.screening import Screened
@@ -70,7 +70,8 @@ def test_points_are_simulated_alike_alone_and_among_many(bench):
 @pytest.mark.parametrize("place", ["force", "position"])
 def test_a_curve_that_always_acts_leaves_what_it_leaves_among_others(bench, place):
     curve = straight_along(bench, place, "position", quantities(bench), 9)
-    coefficients = np.random.default_rng(9).uniform(-30.0, 30.0, 9)
+    # Thirty thousandths of the signal's unit, in probes.
+    coefficients = np.random.default_rng(9).uniform(-0.03, 0.03, 9) / probe_at(bench, place)
     points = bench.nominal[None]
     readings = bench.problem.samples.outputs
     expected = readings - outputs_with(bench, points, coefficients[None], curve)[0]

@@ -1,6 +1,7 @@
 """The result of a diagnosis: verdict, causes, what could be there instead, the extended model, and its gain."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -9,7 +10,10 @@ from ehsvjax.diagnose.misfit import Misfit
 from ehsvjax.diagnose.missing import MissingTerm
 from ehsvjax.diagnose.process_noise import ProcessNoise
 from ehsvjax.diagnose.selection import Integration
+from ehsvjax.effects import BANK
+from ehsvjax.effects.effect import Effect
 from ehsvjax.fit import Fit
+from ehsvjax.models.model import Model
 from ehsvjax.record import Record
 
 if TYPE_CHECKING:
@@ -91,3 +95,34 @@ class Diagnosis:
         from ehsvjax.diagnose.page import write_page
 
         write_page(self, path)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.
+
+        Raises:
+            OSError: if it cannot be written; a file that was there stays as it was.
+
+        """
+        from ehsvjax.storage import save_diagnosis
+
+        save_diagnosis(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] = BANK) -> "Diagnosis":
+        """Read a diagnosis that `save` wrote: it prints, draws and reports the same.
+
+        Args:
+            path: the file.
+            model: needed for a model of your own, as equations are not stored: the one that was fitted; those of this
+                package are made again.
+            bank: needed for an effect of your own, `(*ehsvjax.effects.BANK, my_effect)`.
+
+        Raises:
+            ValueError: if the file holds no diagnosis, was altered, or needs a model or an effect that was not handed
+                over.
+            OSError: if the file is not there or may not be read.
+
+        """
+        from ehsvjax.storage import load_diagnosis
+
+        return load_diagnosis(path, model, bank)

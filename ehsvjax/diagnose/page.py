@@ -9,6 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from ehsvjax.diagnose import words
 from ehsvjax.diagnose.diagnosis import Diagnosis
 from ehsvjax.diagnose.pictures import plot_diagnosis
+from ehsvjax.files import written_whole
 from ehsvjax.plots import embedded, plot_fit, to_png
 
 _HEADS = ("cause", "signal", "size", "unit", "score", "p, whole search", "gain", "smallest to be found", "looks like")
@@ -40,7 +41,8 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
     )
     file = Path(path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(page, encoding="utf-8")
+    with written_whole(file) as whole:
+        whole.write(page.encode())
 
 
 def _row(row) -> dict:

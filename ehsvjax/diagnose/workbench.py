@@ -196,7 +196,7 @@ def _bench(fit: Fit, record: Record, bank: Sequence[Effect], probes: Mapping[str
     places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
     probes = {place: _probe(internal.values[place]) for place in places} | dict(probes)
     forces = [s.name for s in model.signals if s.kind in ("force", "load") and s.name in places]
-    scales = {c.name: _scales(c, internal, record, probes, forces) for c in found}
+    scales = {c.name: _scales(model, c, internal, record, probes, forces) for c in found}
     duration = len(record) * record.sample_period
     numbers = {c.parameter(p.name): _free(c, p, model, scales[c.name]) for c in found for p in c.effect.parameters}
     full = extended(model, found, numbers, duration, places)
@@ -251,13 +251,23 @@ def settled(
 
 
 def _scales(
-    candidate: Candidate, internal: Internal, record: Record, probes: Mapping[str, float], forces: Sequence[str]
+    model: Model,
+    candidate: Candidate,
+    internal: Internal,
+    record: Record,
+    probes: Mapping[str, float],
+    forces: Sequence[str],
 ) -> Scales:
     def largest(series):
         return float(np.max(np.abs(series))) if np.all(np.isfinite(series)) else 0.0
 
     signal = candidate.signal
     value = record.inputs.get(signal, internal.values.get(signal, np.ones(1)))
+    least = 0.0
+    if candidate.effect.kind == "constant":
+        # Of a constant, how large it can be.
+        bounds = model.parameter(signal)
+        value, least = np.array([bounds.lower, bounds.upper]), bounds.lower
     context = {input_named(name): largest(series) for name, series in record.inputs.items()}
     for name, series in internal.contexts.get(signal, {}).items():
         context[name] = largest(series)
@@ -265,6 +275,7 @@ def _scales(
     return {
         **context,
         "value": largest(value),
+        "least": least,
         "probe": next((probes[place] for place in (signal, *forces) if place in probes), _PROBE),
         "duration": len(record) * record.sample_period,
         "sample_period": record.sample_period,

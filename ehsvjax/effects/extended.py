@@ -66,6 +66,7 @@ def extended(
         measure=equations.measure,
         prepare=equations.prepare,
         options=(*others, ("effects", names)),
+        layers=(*model.layers, tuple(attached)),
     )
 
 

@@ -1,41 +1,48 @@
 """Effects that only a model can name: a constant that was given wrong, an input that reaches a sensor by itself."""
 
 import functools
+from collections.abc import Sequence
 
 from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, input_named
-from ehsvjax.models.model import Model, Parameter
+from ehsvjax.models.model import Model
+
+_FEEDTHROUGH = "feedthrough_of_"
 
 
 def effects_for(model: Model) -> tuple[Effect, ...]:
-    """Return the candidate causes that no bank can hold, as their names are the model's."""
-    return (*given_wrong(model), *(feedthrough(name, len(model.inputs) == 1) for name in model.inputs))
+    """Return the candidate causes that no bank can hold, as their names are the model's.
+
+    A constant of zero that is a signal of the diagram too has the effects of that signal's kind.
+    """
+    signals = {s.name for s in model.signals}
+    constants = [p for p in model.parameters if p.fixed and not p.certain and "." not in p.name]
+    return (
+        *(_off(p.name) if p.value else _there(p.name) for p in constants if p.value or p.name not in signals),
+        *(_feedthrough(name) for name in model.inputs),
+    )
+
+
+def effect_of_model(name: str, kind: str, numbers: Sequence[str]) -> Effect | None:
+    """Return the effect that `effects_for` gives for some model under that name; None for any other effect."""
+    if kind == "sensor" and name.startswith(_FEEDTHROUGH):
+        return _feedthrough(name.removeprefix(_FEEDTHROUGH))
+    if kind == "constant":
+        return next((e for e in (_off(name), _there(name)) if [p.name for p in e.parameters] == list(numbers)), None)
+    return None
 
 
 @functools.cache
-def feedthrough(name: str, alone: bool) -> Effect:
+def _feedthrough(name: str) -> Effect:
     """Return the effect of an input that a sensor shows at once, the same object for the same input."""
     there = input_named(name)
     return Effect(
-        "feedthrough" if alone else f"feedthrough_of_{name}",
+        f"{_FEEDTHROUGH}{name}",
         "sensor",
         (amplitude("gain", "", lambda s: 1e-3 * s["value"] / max(s[there], 1e-300)),),
         lambda own, y, context: y + own["gain"] * context[there],
         needs=(there,),
         says="the sensor shows a part of the input at once",
         settled_by="declare how the input runs between samples (hold); or a step while the plant is held still",
-    )
-
-
-def given_wrong(model: Model) -> tuple[Effect, ...]:
-    """Return for each constant of a model that is not certain the effect that it is another than was given.
-
-    A constant of zero that is a signal of the diagram too has the effects of that signal's kind.
-    """
-    signals = {s.name for s in model.signals}
-    return tuple(
-        _off(p.name) if p.value else _there(p)
-        for p in model.parameters
-        if p.fixed and not p.certain and "." not in p.name and (p.value or p.name not in signals)
     )
 
 
@@ -46,37 +53,27 @@ def _off(name: str) -> Effect:
         name,
         "constant",
         (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
-        _scaled,
+        lambda own, value, context: value * (1.0 + own["error"]),
         says="a constant of the model is another than was given",
         settled_by=_settled_by(name),
     )
 
 
 @functools.cache
-def _there(parameter: Parameter) -> Effect:
-    """Return the effect of a constant that was given as zero and is not."""
-    largest = max(abs(parameter.lower), abs(parameter.upper))
-    lower = constant(parameter.lower if parameter.lower < 0.0 else 0.0)
-    tries = [share * largest for share in (1e-4, 1e-2, 0.3)]
-    number = EffectParameter("value", "{value}", 0.0, lower, constant(largest), lambda scales: tries)
+def _there(name: str) -> Effect:
+    """Return the effect of a constant that was given as zero and is not, the same object for the same name."""
+    number = EffectParameter(
+        "value", "{value}", 0.0, lambda s: min(s["least"], 0.0), lambda s: s["value"],
+        lambda s: [share * s["value"] for share in (1e-4, 1e-2, 0.3)],
+    )  # fmt: skip
     return Effect(
-        parameter.name,
+        name,
         "constant",
         (number,),
-        _shifted,
+        lambda own, value, context: value + own["value"],
         says="a constant of the model is there, and was given as zero",
-        settled_by=_settled_by(parameter.name),
+        settled_by=_settled_by(name),
     )
-
-
-def _scaled(own, value, context):
-    del context
-    return value * (1.0 + own["error"])
-
-
-def _shifted(own, value, context):
-    del context
-    return value + own["value"]
 
 
 def _settled_by(name: str) -> str:

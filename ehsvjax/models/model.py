@@ -109,6 +109,7 @@ class Model:
             cached factories of them: the same function object is compiled once.
         max_step: longest integration step, s; a sample is divided into as many equal steps as this needs.
         options: how the model was made, for prints and for `Fit.save`.
+        layers: the effects that it was extended by (`ehsvjax.effects.Candidate`), one tuple for each extension.
 
     Raises:
         ValueError: for names that repeat or are none (empty, with blanks at their ends, of two lines), a kind of signal
@@ -128,6 +129,7 @@ class Model:
     max_step: float
     options: tuple[tuple[str, Any], ...] = ()
     prepare: Callable[..., Any] | None = None
+    layers: tuple[tuple[Any, ...], ...] = ()
 
     def __post_init__(self):
         """Refuse what cannot be a model."""

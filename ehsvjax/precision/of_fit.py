@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from ehsvjax.arithmetic import settled_at
 from ehsvjax.failure import warn_of_failure
 from ehsvjax.fit import Fit, checked_record
-from ehsvjax.population import Problem
+from ehsvjax.population import Problem, to_unit
 from ehsvjax.precision.bands import Band, deviations, new_deviations
 from ehsvjax.precision.bootstrap import Bootstrap, bootstrap
 from ehsvjax.precision.profile import ProfileLikelihood, profile_likelihood
@@ -39,6 +40,7 @@ def prepared(fit: Fit, colour: str) -> Prepared:
     values = [fit.parameters[name] for name in problem.free]
     values += [initial[name] for initial in fit.initial for name in problem.free_initial]
     point = np.array(values)
+    problem = settled_at(problem, to_unit(problem.coordinates, point))
     given = fit.noise_variance_given
     return Prepared(problem, point, linearised(problem, point, noise_variance_given=given, colour=colour))
 
