@@ -1,0 +1,95 @@
+"""Tables out of MATLAB files: -v4 to -v7 by SciPy, -v7.3, which is HDF5, by h5py."""
+
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+from os import PathLike
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ehsvjax.files import needed, reading
+
+if TYPE_CHECKING:
+    import h5py
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+_AGAIN = "save it again, with save(file, ..., '-v7')"
+
+
+def mat_table(path: str | PathLike[str]) -> dict[str, Any]:
+    """Variables of a MATLAB file, [n, 1] and [1, n] as [n]; fields of structs by dotted name.
+
+    `data.position` is a field of a struct, `data.signals.0.values` a field of the first element of a struct
+    array or cell. Those of a -v7.3 file are read when they are called. Raises ValueError for a file that cannot be
+    read, ImportError for one of -v7.3 without h5py.
+    """
+    with reading(path, "a MATLAB file", _AGAIN), open(path, "rb") as file:
+        head = file.read(520)
+    if head.startswith(b"MATLAB 7.3 MAT-file") or _HDF5 in (head[:8], head[512:]):
+        return _hdf5_table(path)
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadWarning
+
+    with reading(path, "a MATLAB file", _AGAIN), warnings.catch_warnings():
+        warnings.simplefilter("error", MatReadWarning)  # a variable that cannot be read, or stands there twice
+        variables = loadmat(path, appendmat=False, squeeze_me=True, struct_as_record=False)
+    table: dict[str, Any] = {}
+    for name, value in variables.items():
+        if not name.startswith("__"):
+            table |= _flatten(name, value)
+    return table
+
+
+def _flatten(name: str, value: Any) -> dict[str, Any]:
+    if hasattr(value, "_fieldnames"):
+        parts = {field: getattr(value, field) for field in value._fieldnames}
+    elif isinstance(value, np.ndarray) and value.dtype == object:
+        parts = dict(enumerate(value.flat))
+    else:
+        return {name: value}
+    return {key: leaf for part, inside in parts.items() for key, leaf in _flatten(f"{name}.{part}", inside).items()}
+
+
+def _hdf5_table(path: str | PathLike[str]) -> dict[str, Callable[[], np.ndarray]]:
+    h5py = needed("h5py", "reading MATLAB -v7.3")
+    boundary = partial(reading, path, "a MATLAB v7.3 (HDF5) file", _AGAIN)
+
+    def read(place: str) -> np.ndarray:
+        with boundary(), h5py.File(path, "r") as file:
+            return _values(file[place])
+
+    with boundary(), h5py.File(path, "r") as file:
+        places = dict(_places("", file))
+    return {name: partial(read, place) for name, place in places.items()}
+
+
+def _places(name: str, node: Any) -> Iterator[tuple[str, str]]:
+    """Names of the arrays in and below a group, and where they are in the file."""
+    import h5py
+
+    dot = f"{name}." if name else ""
+    if isinstance(node, h5py.Group):
+        for part in node:
+            # '#refs#' holds what cells refer to; a link into another file is no part of this one
+            if not part.startswith("#") and isinstance(node.get(part, getlink=True), h5py.HardLink):
+                yield from _places(f"{dot}{part}", node[part])
+    elif isinstance(node, h5py.Dataset) and node.dtype == h5py.ref_dtype:
+        for index, reference in enumerate(node[()].T.flat):
+            yield from _places(f"{dot}{index}", node.file[reference])
+    elif isinstance(node, h5py.Dataset):
+        yield name, node.name
+
+
+def _values(dataset: "h5py.Dataset") -> np.ndarray:
+    """The array as MATLAB has it, without axes of length 1; an object, such as a datetime, as a text that says so."""
+    kind = dataset.attrs.get("MATLAB_class", b"double")
+    kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+    if dataset.attrs.get("MATLAB_empty", 0):
+        return np.zeros(0)
+    if "MATLAB_object_decode" in dataset.attrs:
+        return np.array(f"a {kind} of MATLAB")
+    values = np.squeeze(dataset[()].T)
+    if kind == "char":
+        return np.array("".join(chr(code) for code in values.ravel()))
+    return values.astype(bool) if kind == "logical" else values
