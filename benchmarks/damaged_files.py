@@ -81,8 +81,11 @@ def write_hdf5(path: Path, **options: Any) -> None:
 
 def write_mat(path: Path, compressed: bool) -> None:
     from scipy.io import savemat
+    from scipy.sparse import csc_array
 
-    savemat(path, signals(), do_compression=compressed)
+    cell = np.array([np.arange(5.0), "text"], dtype=object)
+    more = {"log": {"deep": {"x": np.arange(4.0) * 1j}}, "cell": cell, "sparse": csc_array(np.eye(5))}
+    savemat(path, signals() | more, do_compression=compressed)
 
 
 def write_parquet(path: Path, checked: bool) -> None:

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ehsvjax.files import needed, reading
+from ehsvjax.mat5 import check_elements
 
 if TYPE_CHECKING:
     import h5py
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
+_DEFLATED = 1032  # at most as many bytes become one
 _AGAIN = "save it again, with save(file, ..., '-v7')"
 
 
@@ -24,16 +26,19 @@ def mat_table(path: str | PathLike[str]) -> dict[str, Any]:
     array or cell. Those of a -v7.3 file are read when they are called. Raises ValueError for a file that cannot be
     read, ImportError for one of -v7.3 without h5py.
     """
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadWarning
+
     with reading(path, "a MATLAB file", _AGAIN), open(path, "rb") as file:
         head = file.read(520)
     if head.startswith(b"MATLAB 7.3 MAT-file") or _HDF5 in (head[:8], head[512:]):
         return _hdf5_table(path)
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadWarning
-
-    with reading(path, "a MATLAB file", _AGAIN), warnings.catch_warnings():
+    with reading(path, "a MATLAB file", _AGAIN), open(path, "rb") as file, warnings.catch_warnings():
+        if 0 not in head[:4]:  # it begins with a text, and is not of -v4
+            check_elements(file.read())
+            file.seek(0)
         warnings.simplefilter("error", MatReadWarning)  # a variable that cannot be read, or stands there twice
-        variables = loadmat(path, appendmat=False, squeeze_me=True, struct_as_record=False)
+        variables = loadmat(file, appendmat=False, squeeze_me=True, struct_as_record=False)
     table: dict[str, Any] = {}
     for name, value in variables.items():
         if not name.startswith("__"):
@@ -89,6 +94,8 @@ def _values(dataset: "h5py.Dataset") -> np.ndarray:
         return np.zeros(0)
     if "MATLAB_object_decode" in dataset.attrs:
         return np.array(f"a {kind} of MATLAB")
+    if dataset.nbytes > _DEFLATED * dataset.id.get_storage_size():
+        raise ValueError(f"{dataset.nbytes} bytes in {dataset.id.get_storage_size()} stored")
     values = np.squeeze(dataset[()].T)
     if kind == "char":
         return np.array("".join(chr(code) for code in values.ravel()))

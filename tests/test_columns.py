@@ -380,7 +380,10 @@ def test_mat_files_of_another_kind(tmp_path):
     hdf5 = tmp_path / "new.mat"
     hdf5.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(512))
     sentence = refusal(Record.from_mat, hdf5, **PLAIN)
-    assert sentence.startswith(f"{hdf5} cannot be read as a MATLAB v7.3 (HDF5) file") and "save(file, ..., '-v7')" in sentence
+    assert (
+        sentence.startswith(f"{hdf5} cannot be read as a MATLAB v7.3 (HDF5) file")
+        and "save(file, ..., '-v7')" in sentence
+    )
     text = tmp_path / "text.mat"
     text.write_text("this is no MATLAB file, but long enough to look at. " * 10)
     assert f"{text} cannot be read as a MATLAB file" in refusal(Record.from_mat, text, **PLAIN)
