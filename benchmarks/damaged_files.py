@@ -7,9 +7,9 @@ in a process apart. What comes of it:
 
 refused     ValueError, TypeError, OSError or ImportError, raised by this package, in one line.
 as it was   read, with the numbers of the file before it was harmed.
-undetected  read with other numbers, of which nothing in the file says that they are wrong: another digit of a text, a bit
+undetected  read with other numbers, and nothing in the file says that they are wrong: another digit of a text, a bit
             of a format without checksums (MATLAB -v6, HDF5 without filters, parquet without page checksums).
-nonsense    read with other numbers although the file shows it: a kind whose numbers are all under a checksum (NPZ, Excel,
+nonsense    read with other numbers although the file shows it: one whose numbers are all under a checksum (NPZ, Excel,
             MATLAB -v7 and -v7.3 as MATLAB writes them, parquet with page checksums, fits, checkpoints), or a text whose
             lines, split at commas and each with as many fields as the header, are not the numbers that were read.
 raw         any other error.

@@ -18,7 +18,7 @@ _COMPLEX = 0x08  # of the flags
 
 
 def check_elements(content: bytes) -> None:
-    """Raise ValueError (zlib.error where it is compressed) unless every element is of a known type and within its own."""
+    """Raise ValueError, of a compressed one zlib.error, unless each element is of a known type and within its own."""
     order = "<" if content[126:128] == b"IM" else ">"
     for kind, body in _elements(content[128:], order):
         parts = list(_elements(zlib.decompress(body), order)) if kind == _COMPRESSED else [(kind, body)]

@@ -1,5 +1,6 @@
 """Tables out of MATLAB files: -v4 to -v7 by SciPy, -v7.3, which is HDF5, by h5py."""
 
+import itertools
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -94,9 +95,20 @@ def _values(dataset: "h5py.Dataset") -> np.ndarray:
         return np.zeros(0)
     if "MATLAB_object_decode" in dataset.attrs:
         return np.array(f"a {kind} of MATLAB")
-    if dataset.nbytes > _DEFLATED * dataset.id.get_storage_size():
-        raise ValueError(f"{dataset.nbytes} bytes in {dataset.id.get_storage_size()} stored")
+    _check_stored(dataset)
     values = np.squeeze(dataset[()].T)
     if kind == "char":
         return np.array("".join(chr(code) for code in values.ravel()))
     return values.astype(bool) if kind == "logical" else values
+
+
+def _check_stored(dataset: "h5py.Dataset") -> None:
+    """Refuse what HDF5 would fill up with zeros: sizes beyond what is stored, chunks that its index has lost."""
+    stored = dataset.id.get_storage_size()
+    if dataset.nbytes > _DEFLATED * stored:
+        raise ValueError(f"an array of {dataset.nbytes} bytes of which {stored} are stored")
+    if dataset.chunks is None:
+        return
+    corners = (range(0, size, step) for size, step in zip(dataset.shape, dataset.chunks, strict=True))
+    for corner in itertools.product(*corners):
+        dataset.id.read_direct_chunk(corner)  # raises where the index leads to no chunk
