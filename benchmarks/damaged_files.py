@@ -27,7 +27,7 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -163,12 +163,12 @@ KINDS = {
 }
 
 
-def outcome(kind: str, number: int, seed: int, folder: Path) -> tuple[str, str]:
-    """Harm the file of that number, read it, and say what came of it, and how."""
+def outcome(kind: str, number: int, seed: int, folder: Path, kinds: Sequence[str] = tuple(KINDS)) -> tuple[str, str]:
+    """Harm the file of that number, or take one of another of the kinds; read it and say what came of it, and how."""
     random = np.random.default_rng([seed, list(KINDS).index(kind), number])
     ways = mutations.ANY + (mutations.OF_TEXT if kind == "csv" else ()) + (None,)
     way = ways[number % len(ways)]
-    others = [other for other in KINDS if other != kind]
+    others = [other for other in kinds if other != kind]
     if way is None:
         name, harmed = "of another kind", (folder / others[random.integers(len(others))]).read_bytes()
     else:

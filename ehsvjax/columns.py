@@ -53,7 +53,7 @@ def pick(
     """
     for kind, columns in (("inputs", inputs), ("outputs", outputs)):
         if not isinstance(columns, Mapping):
-            raise TypeError(f"expected {kind} as a mapping from signal name to column, got {columns!r}")
+            raise TypeError(f"expected {kind} as a mapping from signal name to column, got {shown(columns)}")
     input_values = {name: _si_values(table, source, column) for name, column in inputs.items()}
     output_values = {name: _si_values(table, source, column) for name, column in outputs.items()}
     if is_real(time):
@@ -89,6 +89,12 @@ def is_real(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float | np.integer | np.floating)
 
 
+def shown(value: Any) -> str:
+    """The value as it is written in a sentence: in one line, its first 80 characters."""
+    words = " ".join(repr(value).split())
+    return f"{words[:80]} ..." if len(words) > 80 else words
+
+
 def unknown_name(kind: str, name: str, known: Collection[str], source: str = "", remedy: str = "") -> ValueError:
     """Error for a name that is not there: lists those known (the first 30) and the nearest one, then the remedy."""
     near = difflib.get_close_matches(str(name), known, n=1)
@@ -96,7 +102,7 @@ def unknown_name(kind: str, name: str, known: Collection[str], source: str = "",
     listed = ", ".join(repr(one[:60]) for one in list(known)[:30]) or "none"
     more = f" and {len(known) - 30} more" if len(known) > 30 else ""
     place = f" in {source}" if source else ""
-    return ValueError(f"unknown {kind} {name!r}{place}{hint}; known: {listed}{more}{remedy and f': {remedy}'}")
+    return ValueError(f"unknown {kind} {shown(name)}{place}{hint}; known: {listed}{more}{remedy and f': {remedy}'}")
 
 
 def other_separator(header: str) -> str:
@@ -115,10 +121,10 @@ def _counted(period: float, signals: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _si_values(table: Mapping[str, Any], source: str, column: Any, is_time: bool = False) -> np.ndarray:
     if not isinstance(column, str | Column):
-        raise TypeError(f"expected a column name or a Column(name, scale, offset), got {column!r}")
+        raise TypeError(f"expected a column name or a Column(name, scale, offset), got {shown(column)}")
     name, scale, offset = Column(column) if isinstance(column, str) else column
     if not (isinstance(name, str) and is_real(scale) and is_real(offset)):
-        raise TypeError(f"expected a name, a scale and an offset (a string and two numbers), got {column!r}")
+        raise TypeError(f"expected a name, a scale and an offset (a string and two numbers), got {shown(column)}")
     if name not in table:
         remedy = other_separator(next(iter(table))) if len(table) == 1 else ""
         raise unknown_name("column", name, table.keys(), source, remedy)

@@ -57,7 +57,8 @@ def needed(library: str, purpose: str) -> ModuleType:
     try:
         return importlib.import_module(library)
     except ImportError:
+        package = library.partition(".")[0]
         raise ImportError(
-            f"{purpose} needs {library}, which is not installed: pip install {library}, or all readers with "
+            f"{purpose} needs {package}, which is not installed: pip install {package}, or all readers with "
             "pip install 'ehsvjax[files]'"
         ) from None

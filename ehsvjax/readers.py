@@ -53,7 +53,7 @@ def csv_table(path: str | PathLike[str], **options: Any) -> dict[str, np.ndarray
     _check_options(pandas.read_csv, options)
     options = {"index_col": False, **options}
     remedy = (
-        "check the options sep (';' beside decimal=','), encoding ('latin-1' or 'utf-16', where it is not UTF-8), "
+        "check the options, such as sep=';', decimal=',', encoding='latin-1' or 'utf-16' (where it is not UTF-8), "
         "skiprows and comment, or export the file again"
     )
     fault, short = "", None

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.columns import Column, is_real, pick, unknown_name, vector
+from ehsvjax.columns import Column, is_real, pick, shown, unknown_name, vector
 from ehsvjax.matlab import mat_table
 from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
 from ehsvjax.record_checks import (
@@ -105,7 +105,7 @@ class Record:
         may be constant there; TypeError for bounds that are no numbers.
         """
         first, last = (self._sample_from(bound) for bound in (start, stop))
-        return self._cut(first, last)
+        return self._cut(first, last if start < stop else first)
 
     def split(self, at: float | None = None, *, fraction: float | None = None) -> tuple["Record", "Record"]:
         """Cut in two at a time in s (a sample on it opens the second part) or at a fraction of the samples.
@@ -120,7 +120,7 @@ class Record:
         else:
             raise ValueError(
                 "expected either a time (s) or a fraction between 0 and 1 to split at, "
-                f"got at={at} and fraction={fraction}"
+                f"got at={shown(at)} and fraction={shown(fraction)}"
             )
         return self._cut(0, middle), self._cut(middle, len(self))
 
@@ -132,8 +132,8 @@ class Record:
         interpolated linearly; a missing neighbour makes a missing sample. There is **no anti-aliasing**: before
         going to a coarser grid, low-pass the outputs yourself.
 
-        A step of the time stamps that is longer than two usual ones (their median) is a gap. Nothing is known of the
-        outputs there, they are missing samples; nor of the inputs, which cannot be missing, so that a gap is refused
+        A step of the time stamps that is longer than two usual ones (their median; half a one more, for jitter) is a gap,
+        which one lost row is not. Nothing is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so that a gap is refused
         unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command does that is logged
         when it changes.
 
@@ -142,7 +142,7 @@ class Record:
         """
         if not is_real(sample_period) or not 0 < sample_period <= self.duration:
             raise ValueError(
-                f"cannot resample {self.name!r} to a period of {sample_period} s: "
+                f"cannot resample {self.name!r} to a period of {shown(sample_period)} s: "
                 f"expected a positive period of at most its duration of {self.duration:.6g} s"
             )
         if self.duration / sample_period > 1e8:
@@ -150,6 +150,8 @@ class Record:
                 f"cannot resample {self.name!r} to a period of {sample_period} s: its {self.duration:.6g} s would be "
                 "more than 1e8 samples, is the period in s?"
             )
+        if not isinstance(inputs_known_in_gaps, bool):
+            raise TypeError(f"expected inputs_known_in_gaps=True or False, got {shown(inputs_known_in_gaps)}")
         gaps = _gaps(self.time)
         if self.inputs and gaps.any() and not inputs_known_in_gaps:
             raise ValueError(_unknown_inputs(self.name, self.time, gaps))
@@ -174,7 +176,7 @@ class Record:
         if isinstance(outputs, str):
             raise TypeError(f"expected a list of output names, got a string: write outputs=[{outputs!r}]")
         if not isinstance(outputs, Iterable):
-            raise TypeError(f"expected a list of output names, got {outputs!r}")
+            raise TypeError(f"expected a list of output names, got {shown(outputs)}")
         outputs = list(outputs)
         for name in outputs:
             if not isinstance(name, str) or name not in self.outputs:
@@ -330,7 +332,7 @@ class Record:
 
     def _sample_from(self, bound: float) -> int:
         if not is_real(bound):
-            raise TypeError(f"expected a time in s to cut {self.name!r} at ({self._span()}), got {bound!r}")
+            raise TypeError(f"expected a time in s to cut {self.name!r} at ({self._span()}), got {shown(bound)}")
         return int(np.searchsorted(self.time, bound - TOLERANCE * np.diff(self.time).min()))
 
     def _cut(self, first: int, last: int) -> "Record":
@@ -348,9 +350,9 @@ class Record:
 
 
 def _gaps(time: np.ndarray) -> np.ndarray:
-    """Which steps of the time stamps are longer than two usual ones, [time - 1]."""
+    """Which steps of the time stamps are longer than two usual ones, with half a step for jitter; [time - 1]."""
     steps = np.diff(time)
-    return steps > (2 + TOLERANCE) * np.median(steps)
+    return steps > 2.5 * np.median(steps)
 
 
 def _unknown_inputs(name: str, time: np.ndarray, gaps: np.ndarray) -> str:

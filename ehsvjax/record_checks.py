@@ -5,18 +5,22 @@ from typing import Any
 
 import numpy as np
 
+from ehsvjax.columns import shown
+
 # Share of a period by which a time stamp may be off the uniform grid through the first and the last one.
 # Stamps within 1 % of any straight line always keep to it, as the grid is then itself off by at most 1 %.
 TOLERANCE = 0.02
+# Seconds, 30,000 years: what is beyond is no time in s but one counted in ms, us or ns since 1970.
+_LATEST = 1e12
 
 
 def check_settings(hold: Any, name: Any, uniform: Any) -> None:
     if not isinstance(hold, str) or hold not in ("zero", "linear"):
-        raise ValueError(f"expected hold='zero' or hold='linear', got {hold!r}")
+        raise ValueError(f"expected hold='zero' or hold='linear', got {shown(hold)}")
     if not isinstance(name, str):
-        raise TypeError(f"expected a record's name as a string, got {name!r}")
+        raise TypeError(f"expected a record's name as a string, got {shown(name)}")
     if not isinstance(uniform, bool | np.bool_):
-        raise TypeError(f"expected uniform=True or uniform=False, got {uniform!r}")
+        raise TypeError(f"expected uniform=True or uniform=False, got {shown(uniform)}")
 
 
 def check_names(inputs: Any, outputs: Any) -> None:
@@ -25,7 +29,7 @@ def check_names(inputs: Any, outputs: Any) -> None:
             raise TypeError(f"expected {kind} as a mapping from name to values, got {type(signals).__name__}")
         for name in signals:
             if not isinstance(name, str) or not name:
-                raise TypeError(f"expected names of {kind} that are strings and not empty, got {name!r}")
+                raise TypeError(f"expected names of {kind} that are strings and not empty, got {shown(name)}")
             if name == "time":
                 raise ValueError(f"'time' cannot be one of the {kind}: time is given apart, rename the signal")
     for name in inputs:
@@ -40,6 +44,11 @@ def check_time(time: np.ndarray) -> None:
     if unknown_time.any():
         row = _first(unknown_time)
         raise ValueError(f"time is {time[row]} at sample {row}: remove the row or fill in its time")
+    if np.abs(time).max() > _LATEST:
+        raise ValueError(
+            f"time runs from {time[0]:.6g} to {time[-1]:.6g}, which are no seconds: give its column a scale, such as "
+            "Column(name, 1e-3) for ms or 1e-9 for ns"
+        )
     standing = np.diff(time) <= 0
     if standing.any():
         row = _first(standing) + 1
@@ -47,8 +56,6 @@ def check_time(time: np.ndarray) -> None:
             f"time does not increase at sample {row} ({time[row]:.9g} s after {time[row - 1]:.9g} s): "
             "sort the rows by time and remove repeated ones"
         )
-    if not np.isfinite(time[-1] - time[0]):
-        raise ValueError(f"time runs from {time[0]:.6g} to {time[-1]:.6g} s: check its column and its unit")
 
 
 def check_uniform(time: np.ndarray) -> None:
