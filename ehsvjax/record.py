@@ -132,10 +132,10 @@ class Record:
         interpolated linearly; a missing neighbour makes a missing sample. There is **no anti-aliasing**: before
         going to a coarser grid, low-pass the outputs yourself.
 
-        A step of the time stamps that is longer than two usual ones (their median; half a one more, for jitter) is a gap,
-        which one lost row is not. Nothing is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so that a gap is refused
-        unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command does that is logged
-        when it changes.
+        A step of the time stamps longer than two usual ones (their median; half a one more, for jitter) is a gap. Nothing
+        is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so that
+        the gap is refused unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command does
+        that is logged when it changes.
 
         Raises ValueError for a gap in the inputs, and unless the period (s) is positive, at most the record's duration
         and not so short that there were more than 10^8 samples.
