@@ -14,16 +14,7 @@ from jaxtyping import Float
 from ehsvjax.columns import Column, is_real, pick, shown, unknown_name, vector
 from ehsvjax.matlab import mat_table
 from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
-from ehsvjax.record_checks import (
-    TOLERANCE,
-    check_input,
-    check_length,
-    check_names,
-    check_output,
-    check_settings,
-    check_time,
-    check_uniform,
-)
+from ehsvjax.record_checks import TOLERANCE, check_names, check_samples, check_settings, check_time, check_uniform
 
 if TYPE_CHECKING:
     import pandas
@@ -66,12 +57,7 @@ class Record:
         check_time(time)
         if self.uniform:
             check_uniform(time)
-        for name, values in inputs.items():
-            check_length(f"input {name!r}", values, time)
-            check_input(f"input {name!r}", values)
-        for name, values in outputs.items():
-            check_length(f"output {name!r}", values, time)
-            check_output(f"output {name!r}", values)
+        check_samples(time, inputs, outputs)
         for values in (time, *inputs.values(), *outputs.values()):
             values.setflags(write=False)
         object.__setattr__(self, "time", time)
@@ -132,10 +118,10 @@ class Record:
         interpolated linearly; a missing neighbour makes a missing sample. There is **no anti-aliasing**: before
         going to a coarser grid, low-pass the outputs yourself.
 
-        A step of the time stamps longer than two usual ones (their median; half a one more, for jitter) is a gap. Nothing
-        is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so that
-        the gap is refused unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command does
-        that is logged when it changes.
+        A step of the time stamps longer than two usual ones (their median; half a one more, for jitter) is a gap.
+        Nothing is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so
+        that the gap is refused unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command
+        does that is logged when it changes.
 
         Raises ValueError for a gap in the inputs, and unless the period (s) is positive, at most the record's duration
         and not so short that there were more than 10^8 samples.

@@ -1,9 +1,10 @@
-"""What makes samples on a time a record: each check raises ValueError with the signal, the sample and the remedy."""
+"""What makes samples on a time a record; refusals name the signal, the sample (counted from 0) and the remedy."""
 
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ehsvjax.columns import shown
 
@@ -15,6 +16,7 @@ _LATEST = 1e12
 
 
 def check_settings(hold: Any, name: Any, uniform: Any) -> None:
+    """Raise ValueError for another hold, TypeError for a name or a `uniform` of another type."""
     if not isinstance(hold, str) or hold not in ("zero", "linear"):
         raise ValueError(f"expected hold='zero' or hold='linear', got {shown(hold)}")
     if not isinstance(name, str):
@@ -24,6 +26,7 @@ def check_settings(hold: Any, name: Any, uniform: Any) -> None:
 
 
 def check_names(inputs: Any, outputs: Any) -> None:
+    """Raise TypeError for signals without names, ValueError for a name that is taken."""
     for kind, signals in (("inputs", inputs), ("outputs", outputs)):
         if not isinstance(signals, Mapping):
             raise TypeError(f"expected {kind} as a mapping from name to values, got {type(signals).__name__}")
@@ -37,7 +40,8 @@ def check_names(inputs: Any, outputs: Any) -> None:
             raise ValueError(f"signal {name!r} is both an input and an output: rename one or leave it out")
 
 
-def check_time(time: np.ndarray) -> None:
+def check_time(time: Float[np.ndarray, " time"]) -> None:
+    """Raise ValueError unless there are two stamps or more, in s, finite and increasing."""
     if len(time) < 2:
         raise ValueError("time has 1 sample: a record needs at least 2, pass a longer one")
     unknown_time = ~np.isfinite(time)
@@ -58,7 +62,8 @@ def check_time(time: np.ndarray) -> None:
         )
 
 
-def check_uniform(time: np.ndarray) -> None:
+def check_uniform(time: Float[np.ndarray, " time"]) -> None:
+    """Raise ValueError where stamps stray from the straight line through the first and the last one."""
     period = (time[-1] - time[0]) / (len(time) - 1)
     straying = np.abs(time - np.linspace(time[0], time[-1], len(time))).max() / period
     if straying > TOLERANCE:
@@ -72,7 +77,19 @@ def check_uniform(time: np.ndarray) -> None:
         )
 
 
-def check_length(label: str, values: np.ndarray, time: np.ndarray) -> None:
+def check_samples(
+    time: Float[np.ndarray, " time"], inputs: Mapping[str, np.ndarray], outputs: Mapping[str, np.ndarray]
+) -> None:
+    """Raise ValueError for signals of another length, inputs that are not known throughout, outputs that say nothing."""
+    for name, values in inputs.items():
+        _check_length(f"input {name!r}", values, time)
+        _check_input(f"input {name!r}", values)
+    for name, values in outputs.items():
+        _check_length(f"output {name!r}", values, time)
+        _check_output(f"output {name!r}", values)
+
+
+def _check_length(label: str, values: np.ndarray, time: np.ndarray) -> None:
     if len(values) != len(time):
         raise ValueError(
             f"{label} has {len(values)} samples but time has {len(time)}: one of them ends before sample "
@@ -80,7 +97,7 @@ def check_length(label: str, values: np.ndarray, time: np.ndarray) -> None:
         )
 
 
-def check_input(label: str, values: np.ndarray) -> None:
+def _check_input(label: str, values: np.ndarray) -> None:
     if np.isnan(values).all():
         raise ValueError(f"{label} is empty, all {len(values)} samples are NaN: check the name of its column")
     bad = ~np.isfinite(values)
@@ -91,7 +108,7 @@ def check_input(label: str, values: np.ndarray) -> None:
         )
 
 
-def check_output(label: str, values: np.ndarray) -> None:
+def _check_output(label: str, values: np.ndarray) -> None:
     if np.isinf(values).any():
         row = _first(np.isinf(values))
         raise ValueError(f"{label} is {values[row]} at sample {row}: set it to NaN if the sample is missing")
