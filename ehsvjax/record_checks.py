@@ -80,7 +80,7 @@ def check_uniform(time: Float[np.ndarray, " time"]) -> None:
 def check_samples(
     time: Float[np.ndarray, " time"], inputs: Mapping[str, np.ndarray], outputs: Mapping[str, np.ndarray]
 ) -> None:
-    """Raise ValueError for signals of another length, inputs that are not known throughout, outputs that say nothing."""
+    """Raise ValueError for signals of another length, inputs not known throughout, outputs that say nothing."""
     for name, values in inputs.items():
         _check_length(f"input {name!r}", values, time)
         _check_input(f"input {name!r}", values)
