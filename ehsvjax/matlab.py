@@ -1,6 +1,7 @@
 """Tables out of MATLAB files: -v4 to -v7 by SciPy, -v7.3, which is HDF5, by h5py."""
 
 import itertools
+import math
 import warnings
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -89,12 +90,15 @@ def _places(name: str, node: Any) -> Iterator[tuple[str, str]]:
 
 def _values(dataset: "h5py.Dataset") -> np.ndarray:
     """The array as MATLAB has it, without axes of length 1; an object, such as a datetime, as a text that says so."""
-    kind = dataset.attrs.get("MATLAB_class", b"double")
+    kind = dataset.attrs.get("MATLAB_class", dataset.dtype.name)
     kind = kind.decode() if isinstance(kind, bytes) else str(kind)
     if dataset.attrs.get("MATLAB_empty", 0):
         return np.zeros(0)
     if "MATLAB_object_decode" in dataset.attrs:
         return np.array(f"a {kind} of MATLAB")
+    if dataset.dtype.names == ("real", "imag"):
+        return np.squeeze(dataset["real"].T + 1j * dataset["imag"].T)
+    _check_type(dataset, kind)
     _check_stored(dataset)
     values = np.squeeze(dataset[()].T)
     if kind == "char":
@@ -102,13 +106,27 @@ def _values(dataset: "h5py.Dataset") -> np.ndarray:
     return values.astype(bool) if kind == "logical" else values
 
 
+def _check_type(dataset: "h5py.Dataset", kind: str) -> None:
+    """Refuse numbers whose bits are not laid out as those of the class are; others than double have their own name."""
+    import h5py
+
+    name = {"double": "float64", "single": "float32", "logical": "uint8", "char": "uint16"}.get(kind, kind)
+    if dataset.dtype.name != name or dataset.id.get_type() != h5py.h5t.py_create(dataset.dtype):
+        raise ValueError(f"an array of class {kind} whose numbers are stored as {dataset.dtype.name}")
+
+
 def _check_stored(dataset: "h5py.Dataset") -> None:
-    """Refuse what HDF5 would fill up with zeros: sizes beyond what is stored, chunks that its index has lost."""
+    """Refuse what HDF5 would fill up with zeros, or take as it is: chunks that are not stored, lost filters."""
     stored = dataset.id.get_storage_size()
     if dataset.nbytes > _DEFLATED * stored:
         raise ValueError(f"an array of {dataset.nbytes} bytes of which {stored} are stored")
     if dataset.chunks is None:
         return
-    corners = (range(0, size, step) for size, step in zip(dataset.shape, dataset.chunks, strict=True))
+    corners = [range(0, size, step) for size, step in zip(dataset.shape, dataset.chunks, strict=True)]
+    plain = math.prod(dataset.chunks) * dataset.dtype.itemsize
+    if not dataset.id.get_create_plist().get_nfilters() and stored != plain * math.prod(map(len, corners)):
+        raise ValueError(f"chunks of {plain} bytes, not compressed, in {stored} bytes")
     for corner in itertools.product(*corners):
-        dataset.id.read_direct_chunk(corner)  # raises where the index leads to no chunk
+        filters_skipped, chunk = dataset.id.read_direct_chunk(corner)  # raises where the index leads to no chunk
+        if filters_skipped and len(chunk) != plain:
+            raise ValueError(f"a chunk of {plain} bytes, not compressed, in {len(chunk)} bytes")

@@ -67,13 +67,15 @@ def test_structs_cells_and_texts_of_matlab_7_3(tmp_path):
     with h5py.File(path, "r+") as file:
         file["cell"] = np.array([[file["#refs#/a"].ref]], dtype=h5py.ref_dtype)
         for name, kind, values in (
-            ("note", "char", [[111], [112]]),
-            ("on", "logical", [[1, 0, 1]]),
-            ("none", "double", [0, 0]),
-            ("when", "datetime", [[1, 2, 3]]),
+            ("note", "char", np.array([[111], [112]], np.uint16)),
+            ("on", "logical", np.array([[1, 0, 1]], np.uint8)),
+            ("none", "double", np.array([0, 0], np.uint64)),
+            ("when", "datetime", np.array([[1, 2, 3]], np.uint32)),
             ("wide", "double", np.ones((2, 3))),
+            ("wave", "double", np.ones((1, 3), [("real", float), ("imag", float)])),
+            ("odd", "double", np.ones((1, 3), np.longdouble)),
         ):
-            file[name] = np.array(values)
+            file[name] = values
             file[name].attrs["MATLAB_class"] = np.bytes_(kind)
         file["none"].attrs["MATLAB_empty"] = 1
         file["when"].attrs["MATLAB_object_decode"] = 3
@@ -85,10 +87,14 @@ def test_structs_cells_and_texts_of_matlab_7_3(tmp_path):
         ("none", "is empty"),
         ("when", "holds 'a datetime of MATLAB'"),
         ("wide", "has shape (3, 2)"),
+        ("wave", "holds '(1+1j)' at sample 0"),
     ):
         assert f"column {name!r} of {path} {fault}" in refusal(
             Record.from_mat, path, time="data.t", inputs={}, outputs={"position": name}
         )
+    assert "an array of class double whose numbers are stored as" in refusal(
+        Record.from_mat, path, time="odd", inputs={}, outputs={}
+    )
     sentence = refusal(Record.from_mat, path, time="x", inputs={}, outputs={})
     assert "'#refs#" not in sentence and "known: 'cell.0', 'data.t', " in sentence
 
