@@ -31,6 +31,7 @@ benchmarks: $(VENV)/installed-benchmark
 	$(BIN)/python benchmarks/against_c.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/cold_start.py
+	$(BIN)/python benchmarks/damaged_files.py
 
 $(VENV)/bin/python:
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'ehsvjax needs Python 3.11 or newer')"

@@ -1,23 +1,19 @@
-"""Columns of numbers out of data frames and files: CSV, NPZ and MATLAB.
+"""Columns of numbers out of a table, converted to SI units.
 
-A reader gives a table, that is a mapping from column name to raw values; `pick` takes the columns that are
-asked for and converts them to SI units. What makes a valid record of them is checked in `ehsvjax.record`.
+A table is a mapping from column name to raw values, or to a function that reads them; `ehsvjax.readers` and
+`ehsvjax.matlab` make one of a file. What makes a valid record of the columns is checked in `ehsvjax.record`.
 """
 
 import difflib
-import warnings
-import zipfile
 from collections.abc import Collection, Mapping
-from os import PathLike
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-if TYPE_CHECKING:
-    import pandas
+from ehsvjax.clock import seconds_of
+from ehsvjax.files import reason_of
 
 
 class Column(NamedTuple):
@@ -50,100 +46,19 @@ def pick(
     """Take the named columns of a table as float64 in SI units.
 
     `source` is what error messages call the table. `time` is a column or, where the table has none, the
-    sample period in s. Lengths may differ here; they are compared by `Record`, which also refuses NaN and the
-    like. Raises ValueError for an unknown column (with those known), a zero or infinite scale, or a column
-    that is not a vector of real numbers; TypeError for a column that is neither a name nor a `Column`.
+    sample period in s; dates and clock times count in s from the first sample on, time differences as they are. Lengths
+    may differ here; they are compared by `Record`, which also refuses NaN and the like. Raises ValueError for an
+    unknown column (with those known), a zero or infinite scale, or a column that is not a vector of real numbers;
+    TypeError for a column that is neither a name nor a `Column`.
     """
     for kind, columns in (("inputs", inputs), ("outputs", outputs)):
         if not isinstance(columns, Mapping):
-            raise TypeError(f"expected {kind} as a mapping from signal name to column, got {columns!r}")
+            raise TypeError(f"expected {kind} as a mapping from signal name to column, got {shown(columns)}")
     input_values = {name: _si_values(table, source, column) for name, column in inputs.items()}
     output_values = {name: _si_values(table, source, column) for name, column in outputs.items()}
-    if not isinstance(time, int | float | np.number):
-        return Signals(_si_values(table, source, time), input_values, output_values)
-    if not 0 < time < np.inf:
-        raise ValueError(f"time={time} is not a sample period: give a positive number of seconds or a column name")
-    if not (input_values or output_values):
-        raise ValueError(f"time={time} needs an input or an output to count the samples of: name one")
-    count = len(next(iter((input_values | output_values).values())))
-    return Signals(time * np.arange(count), input_values, output_values)
-
-
-def frame_table(frame: "pandas.DataFrame", source: str = "the data frame") -> dict[str, np.ndarray]:
-    """Columns of a data frame by name; a name that is no string, as with header=None, by its str().
-
-    Raises ValueError where two columns have one name.
-    """
-    names = [str(label) for label in frame.columns]
-    repeated = next((name for name in names if names.count(name) > 1), None)
-    if repeated is not None:
-        raise ValueError(f"column {repeated!r} stands more than once in {source}: rename all but one")
-    return {name: frame.iloc[:, index].to_numpy() for index, name in enumerate(names)}
-
-
-def csv_table(path: str | PathLike[str], **options: Any) -> dict[str, np.ndarray]:
-    """Columns of a text file by the names in its header; `options` go to `pandas.read_csv`.
-
-    Raises ValueError for an empty file, a repeated name, or rows that are longer than the header.
-    """
-    import pandas
-
-    _refuse_empty_file(path)
-    try:
-        with warnings.catch_warnings():
-            # by default pandas takes the surplus fields for an index and shifts every column
-            warnings.filterwarnings("error", "Length of header", pandas.errors.ParserWarning)
-            frame = pandas.read_csv(path, **{"index_col": False, **options})
-    except pandas.errors.ParserWarning:
-        raise ValueError(
-            f"the rows of {path} have more fields than its header: name them all (header=0, names=[...])"
-        ) from None
-    except pandas.errors.EmptyDataError:
-        raise ValueError(f"{path} holds no columns: check skiprows and comment, or the export") from None
-    # pandas renames the second 'x' to 'x.1'; names= says that the names are meant as they are
-    repeated = [name for name in frame.columns if f"{name}.1" in frame.columns]
-    if repeated and "names" not in options:
-        raise ValueError(
-            f"column {str(repeated[0])!r} stands more than once in {path} (or has a neighbour named "
-            f"'{repeated[0]}.1'): rename one, or name all columns with header=0, names=[...]"
-        )
-    return frame_table(frame, str(path))
-
-
-def open_npz(path: str | PathLike[str]) -> np.lib.npyio.NpzFile:
-    """Open an archive written by `numpy.savez`, arrays by name, for a `with` block.
-
-    An array is read when it is asked for; pickled content never is. Raises ValueError where it is no such
-    archive.
-    """
-    _refuse_empty_file(path)
-    if not zipfile.is_zipfile(path):
-        raise ValueError(f"{path} is not an NPZ archive: write one with numpy.savez(path, name=array, ...)")
-    return np.load(path, allow_pickle=False)
-
-
-def mat_table(path: str | PathLike[str]) -> dict[str, Any]:
-    """Variables of a MATLAB file (-v4 to -v7), [n, 1] and [1, n] as [n]; fields of structs by dotted name.
-
-    `data.position` is a field of a struct, `data.signals.0.values` a field of the first element of a struct
-    array or cell. Raises ValueError for an empty file and for -v7.3 (HDF5).
-    """
-    from scipy.io import loadmat
-
-    _refuse_empty_file(path)
-    try:
-        variables = loadmat(path, appendmat=False, squeeze_me=True, struct_as_record=False)
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be read as a MATLAB file ({error}): save it with '-v7'") from None
-    except NotImplementedError:
-        raise ValueError(
-            f"{path} is a MATLAB v7.3 (HDF5) file, which cannot be read: save it with save(file, ..., '-v7')"
-        ) from None
-    table: dict[str, Any] = {}
-    for name, value in variables.items():
-        if not name.startswith("__"):
-            _flatten(name, value, table)
-    return table
+    if is_real(time):
+        return Signals(_counted(time, input_values | output_values), input_values, output_values)
+    return Signals(_si_values(table, source, time, is_time=True), input_values, output_values)
 
 
 def vector(label: str, values: ArrayLike) -> Float[np.ndarray, " time"]:
@@ -152,7 +67,10 @@ def vector(label: str, values: ArrayLike) -> Float[np.ndarray, " time"]:
     Raises ValueError, naming `label`, for an empty, masked or not one-dimensional array and for anything but
     real numbers.
     """
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except Exception as error:  # what NumPy, JAX or pandas say of ragged lists, traced values, ...
+        raise ValueError(f"{label} is no array ({reason_of(error)}): expected one real number per sample") from None
     if isinstance(values, np.ma.MaskedArray):
         raise ValueError(f"{label} is a masked array: use .filled(numpy.nan), NaN is a missing output sample")
     if array.size == 0:
@@ -164,67 +82,96 @@ def vector(label: str, values: ArrayLike) -> Float[np.ndarray, " time"]:
     return array.astype(np.float64)
 
 
-def unknown_name(kind: str, name: str, known: Collection[str], source: str = "") -> ValueError:
-    """Error for a name that is not there: lists those known (the first 30) and the nearest one."""
-    near = difflib.get_close_matches(name, known, n=1)
+def is_real(value: Any) -> TypeGuard[float]:
+    """Whether it is one real number that a float can hold, which True and 10**400 are not."""
+    if isinstance(value, int) and (isinstance(value, bool) or value.bit_length() > 1023):
+        return False
+    return isinstance(value, int | float | np.integer | np.floating)
+
+
+def shown(value: Any) -> str:
+    """The value as it is written in a sentence: in one line, its first 80 characters."""
+    words = " ".join(repr(value).split())
+    return f"{words[:80]} ..." if len(words) > 80 else words
+
+
+def unknown_name(kind: str, name: str, known: Collection[str], source: str = "", remedy: str = "") -> ValueError:
+    """Error for a name that is not there: lists those known (the first 30) and the nearest one, then the remedy."""
+    near = difflib.get_close_matches(str(name), known, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""
-    listed = ", ".join(repr(one) for one in list(known)[:30]) or "none"
+    listed = ", ".join(repr(one[:60]) for one in list(known)[:30]) or "none"
     more = f" and {len(known) - 30} more" if len(known) > 30 else ""
     place = f" in {source}" if source else ""
-    return ValueError(f"unknown {kind} {name!r}{place}{hint}; known: {listed}{more}")
+    return ValueError(f"unknown {kind} {shown(name)}{place}{hint}; known: {listed}{more}{remedy and f': {remedy}'}")
 
 
-def _si_values(table: Mapping[str, Any], source: str, column: str | Column) -> np.ndarray:
+def other_separator(header: str) -> str:
+    """What to do about a header that came as one column, "" if it can be one."""
+    separator = next((mark for mark in ";\t|" if mark in header), None)
+    return f"give sep={separator!r}, and decimal=',' if the numbers have commas" if separator else ""
+
+
+def _counted(period: float, signals: Mapping[str, np.ndarray]) -> np.ndarray:
+    if not 0 < period < np.inf:
+        raise ValueError(f"time={period} is not a sample period: give a positive number of seconds or a column name")
+    if not signals:
+        raise ValueError(f"time={period} needs an input or an output to count the samples of: name one")
+    return period * np.arange(len(next(iter(signals.values()))))
+
+
+def _si_values(table: Mapping[str, Any], source: str, column: Any, is_time: bool = False) -> np.ndarray:
     if not isinstance(column, str | Column):
-        raise TypeError(f"expected a column name or a Column(name, scale, offset), got {column!r}")
+        raise TypeError(f"expected a column name or a Column(name, scale, offset), got {shown(column)}")
     name, scale, offset = Column(column) if isinstance(column, str) else column
+    if not (isinstance(name, str) and is_real(scale) and is_real(offset)):
+        raise TypeError(f"expected a name, a scale and an offset (a string and two numbers), got {shown(column)}")
     if name not in table:
-        raise unknown_name("column", name, table.keys(), source)
+        remedy = other_separator(next(iter(table))) if len(table) == 1 else ""
+        raise unknown_name("column", name, table.keys(), source, remedy)
     label = f"column {name!r} of {source}"
     if not np.isfinite([scale, offset]).all() or scale == 0:
         raise ValueError(f"{label} has scale {scale}, offset {offset}: give finite numbers and a scale other than 0")
-    try:
-        raw = table[name]
-    except ValueError as error:  # an NPZ array is read only here
-        raise ValueError(
-            f"{label} is not a plain array ({error}): pickled content is never loaded, save it as numbers"
-        ) from None
-    return scale * vector(label, raw) + offset
-
-
-def _flatten(name: str, value: Any, table: dict[str, Any]) -> None:
-    if hasattr(value, "_fieldnames"):
-        for field in value._fieldnames:
-            _flatten(f"{name}.{field}", getattr(value, field), table)
-    elif isinstance(value, np.ndarray) and value.dtype == object:
-        for index, element in enumerate(value.flat):
-            _flatten(f"{name}.{index}", element, table)
-    else:
-        table[name] = value
-
-
-def _refuse_empty_file(path: str | PathLike[str]) -> None:
-    if Path(path).stat().st_size == 0:
-        raise ValueError(f"{path} is an empty file: check that the export or the download was completed")
+    raw = table[name]() if callable(table[name]) else table[name]
+    seconds = seconds_of(raw) if is_time else None
+    if seconds is None:
+        return scale * vector(label, raw) + offset
+    if scale != 1:
+        raise ValueError(f"{label} holds dates or times, counted in s already: leave out its scale of {scale}")
+    return seconds + offset
 
 
 def _not_real(label: str, array: np.ndarray) -> str:
+    row = 0
+    if array.dtype.kind in "OUST":
+        row = next((row for row, value in enumerate(array) if not _reads_as_number(value)), 0)
     remedy = {
         "c": "take its real part or its magnitude",
         "b": "convert it with .astype(float)",
         "M": "convert the dates to seconds",
         "m": "convert the time differences to seconds",
-    }.get(array.dtype.kind, "use .astype(float) or, in pandas.read_csv, skiprows, comment, na_values or decimal")
-    row = 0
-    if array.dtype.kind in "OUST":
-        row = next((row for row, value in enumerate(array) if not _reads_as_number(value)), 0)
-    found = f"{str(array[row])!r} at sample {row} (dtype {array.dtype})"
+    }.get(array.dtype.kind) or _remedy_for_text(array, row)
+    found = f"{str(array[row])[:60]!r} at sample {row} (dtype {array.dtype})"
     return f"{label} holds {found}: expected real numbers; {remedy}"
+
+
+def _remedy_for_text(array: np.ndarray, row: int) -> str:
+    text = str(array[row])
+    if _reads_as_number(text.replace(",", ".", 1)) and "," in text:
+        return "decimal=',' reads a decimal comma"
+    first = row == 0 and not _reads_as_number(text)
+    if first and len(array) > 1 and _reads_as_number(str(array[1]).replace(",", ".", 1)):
+        return "skiprows=[1] leaves out a row of units below the header"
+    if sum(text.count(mark) for mark in ".-/:") > 1 and any(digit in text for digit in "0123456789"):
+        return (
+            "as time, ISO 8601 dates and hh:mm:ss are read; for others parse_dates=[name], "
+            "date_format='%d.%m.%Y %H:%M:%S.%f', as pandas.read_csv has them"
+        )
+    return "use .astype(float) or, in pandas.read_csv, skiprows, comment, na_values or decimal"
 
 
 def _reads_as_number(value: Any) -> bool:
     try:
         float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return False
     return True

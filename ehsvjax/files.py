@@ -1,15 +1,23 @@
-"""Files at the edge: written whole or not at all, and what is wrong with one that cannot be read, in one sentence."""
+"""Files at the edge: written whole or not at all; whatever a library raises while it reads one becomes one sentence.
 
-import contextlib
+    with reading(path, "a MATLAB file", "save it again with '-v7'"):
+        variables = loadmat(path)
+
+Only the library's calls belong inside; what the package itself refuses in the content is raised after the block.
+"""
+
+import importlib
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import BinaryIO
 
 
-@contextlib.contextmanager
+@contextmanager
 def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
     """Open a file to be written in bytes, which takes its place at `path` once it is complete.
 
@@ -46,33 +54,52 @@ def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
         raise
 
 
-@contextlib.contextmanager
-def reading(path: str | os.PathLike, what: str, remedy: str) -> Iterator[None]:
-    """Turn whatever a library raises on a damaged file into one sentence.
-
-    Args:
-        path: the file.
-        what: it should be, "a fit written by Fit.save".
-        remedy: what to do, "save the fit again".
+@contextmanager
+def reading(path: str | os.PathLike[str], what: str, remedy: str) -> Iterator[None]:
+    """Run the block that reads the file `path` as `what`, e.g. "a MATLAB file"; `remedy` says what to do if it fails.
 
     Raises:
-        ValueError: with the file, what was expected, what is wrong, and the remedy.
-        OSError: if the file is not there or may not be read.
+        TypeError: if `path` is no path.
+        OSError: of its usual kind (FileNotFoundError, PermissionError, IsADirectoryError), if there is nothing to open.
+        ValueError: for an empty file, and with the library's reason for every error that the block raises: once the
+            file is open, all that can be wrong is in it.
 
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(f"expected the path of {what}, got {type(path).__name__}: give a string or a pathlib.Path")
+    try:
+        with open(path, "rb") as file:
+            empty = not file.read(1)
+    except OSError as error:
+        reason = (error.strerror or type(error).__name__).lower()
+        raise type(error)(
+            f"{path} cannot be opened ({reason}): check its name and folder, and who may read it; "
+            f"the current folder is {os.getcwd()}"
+        ) from None
+    except ValueError as error:
+        raise ValueError(f"{path!r} is not a path ({error}): give the name of a file") from None
+    if empty:
+        raise ValueError(f"{path} is an empty file: check that the export or the download was completed")
     try:
         yield
-    except OSError as error:
-        # Where the system does not open a file it names it; elsewhere a library was led astray by what is in it.
-        if error.filename is not None:
-            raise
-        raise ValueError(_sentence(path, what, error, remedy)) from error
     except Exception as error:
-        raise ValueError(_sentence(path, what, error, remedy)) from error
+        raise ValueError(f"{path} cannot be read as {what} ({reason_of(error)}): {remedy}") from None
 
 
-def _sentence(path: str | os.PathLike, what: str, error: Exception, remedy: str) -> str:
-    said = " ".join(str(error).split())
-    return (
-        f"expected {what} at {path}, got a file that cannot be read as one ({said or type(error).__name__}): {remedy}"
-    )
+def reason_of(error: Exception) -> str:
+    """What an error of a library says, its kind and the first 160 characters, in one line."""
+    words = " ".join(str(error).split()).rstrip(".")
+    kind = type(error).__name__
+    return f"{kind}: {words[:160]}{' ...' if len(words) > 160 else ''}" if words else kind
+
+
+def needed(library: str, purpose: str) -> ModuleType:
+    """Import an optional library; raises ImportError with the command that installs it."""
+    try:
+        return importlib.import_module(library)
+    except ImportError:
+        package = library.partition(".")[0]
+        raise ImportError(
+            f"{purpose} needs {package}, which is not installed: pip install {package}, or all readers with "
+            "pip install 'ehsvjax[files]'"
+        ) from None

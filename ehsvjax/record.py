@@ -1,7 +1,7 @@
 """Measured data: time, named inputs and named outputs, checked once, when a record is made."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.columns import Column, csv_table, frame_table, mat_table, open_npz, pick, unknown_name, vector
+from ehsvjax.columns import Column, is_real, pick, shown, unknown_name, vector
+from ehsvjax.matlab import mat_table
+from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
+from ehsvjax.record_checks import TOLERANCE, check_names, check_samples, check_settings, check_time, check_uniform
 
 if TYPE_CHECKING:
     import pandas
-
-# Share of a period by which a time stamp may be off the uniform grid through the first and the last one.
-# Stamps within 1 % of any straight line always keep to it, as the grid is then itself off by at most 1 %.
-_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -50,20 +49,15 @@ class Record:
 
     def __post_init__(self) -> None:
         """Check and copy the arguments."""
-        _check_hold(self.hold)
-        _check_names(self.inputs, self.outputs)
+        check_settings(self.hold, self.name, self.uniform)
+        check_names(self.inputs, self.outputs)
         time = vector("time", self.time)
         inputs = {name: vector(f"input {name!r}", values) for name, values in self.inputs.items()}
         outputs = {name: vector(f"output {name!r}", values) for name, values in self.outputs.items()}
-        _check_time(time)
+        check_time(time)
         if self.uniform:
-            _check_uniform(time)
-        for name, values in inputs.items():
-            _check_length(f"input {name!r}", values, time)
-            _check_input(f"input {name!r}", values)
-        for name, values in outputs.items():
-            _check_length(f"output {name!r}", values, time)
-            _check_output(f"output {name!r}", values)
+            check_uniform(time)
+        check_samples(time, inputs, outputs)
         for values in (time, *inputs.values(), *outputs.values()):
             values.setflags(write=False)
         object.__setattr__(self, "time", time)
@@ -86,7 +80,7 @@ class Record:
         Raises ValueError if the time of a record made with `uniform=False` is not uniform.
         """
         if not self.uniform:
-            _check_uniform(self.time)
+            check_uniform(self.time)
         return self.duration / (len(self) - 1)
 
     def slice(self, start: float = -math.inf, stop: float = math.inf) -> "Record":
@@ -94,51 +88,72 @@ class Record:
 
         A sample within 2 % of a period of a bound counts as lying on it, so rounded time stamps are cut where
         one expects. Raises ValueError if fewer than two samples are left, and where `Record` does: an output
-        may be constant there.
+        may be constant there; TypeError for bounds that are no numbers.
         """
         first, last = (self._sample_from(bound) for bound in (start, stop))
-        return self._cut(first, last)
+        return self._cut(first, last if start < stop else first)
 
     def split(self, at: float | None = None, *, fraction: float | None = None) -> tuple["Record", "Record"]:
         """Cut in two at a time in s (a sample on it opens the second part) or at a fraction of the samples.
 
-        Raises ValueError unless exactly one of the two is given, or if a part has fewer than two samples.
+        Raises ValueError unless exactly one of the two is given, or if a part has fewer than two samples, TypeError for
+        a time that is no number.
         """
         if at is not None and fraction is None:
             middle = self._sample_from(at)
-        elif at is None and fraction is not None and 0 < fraction < 1:
+        elif at is None and is_real(fraction) and 0 < fraction < 1:
             middle = round(fraction * len(self))
         else:
             raise ValueError(
                 "expected either a time (s) or a fraction between 0 and 1 to split at, "
-                f"got at={at} and fraction={fraction}"
+                f"got at={shown(at)} and fraction={shown(fraction)}"
             )
         return self._cut(0, middle), self._cut(middle, len(self))
 
-    def resample(self, sample_period: float) -> "Record":
+    def resample(self, sample_period: float, *, inputs_known_in_gaps: bool = False) -> "Record":
         """Put the record on a uniform grid from its first time stamp on.
 
         Inputs follow their hold: zero-order hold takes the last value at or before the new time (2 % of a
         step early counts as at it, so that rounding delays nothing), linear interpolates. Outputs are
-        interpolated linearly, also across a gap in the time stamps; a missing neighbour makes a missing
-        sample. There is **no anti-aliasing**: before going to a coarser grid, low-pass the outputs yourself.
-        Raises ValueError unless the period (s) is positive and at most the record's duration.
+        interpolated linearly; a missing neighbour makes a missing sample. There is **no anti-aliasing**: before
+        going to a coarser grid, low-pass the outputs yourself.
+
+        A step of the time stamps longer than two usual ones (their median; half a one more, for jitter) is a gap.
+        Nothing is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so
+        that the gap is refused unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command
+        does that is logged when it changes.
+
+        Raises ValueError for a gap in the inputs, and unless the period (s) is positive, at most the record's duration
+        and not so short that there were more than 10^8 samples.
         """
-        if not 0 < sample_period <= self.duration:
+        if not is_real(sample_period) or not 0 < sample_period <= self.duration:
             raise ValueError(
-                f"cannot resample {self.name!r} to a period of {sample_period} s: "
+                f"cannot resample {self.name!r} to a period of {shown(sample_period)} s: "
                 f"expected a positive period of at most its duration of {self.duration:.6g} s"
             )
-        count = math.floor(self.duration / sample_period + _TOLERANCE) + 1
+        if self.duration / sample_period > 1e8:
+            raise ValueError(
+                f"cannot resample {self.name!r} to a period of {sample_period} s: its {self.duration:.6g} s would be "
+                "more than 1e8 samples, is the period in s?"
+            )
+        if not isinstance(inputs_known_in_gaps, bool):
+            raise TypeError(f"expected inputs_known_in_gaps=True or False, got {shown(inputs_known_in_gaps)}")
+        gaps = _gaps(self.time)
+        if self.inputs and gaps.any() and not inputs_known_in_gaps:
+            raise ValueError(_unknown_inputs(self.name, self.time, gaps))
+        count = math.floor(self.duration / sample_period + TOLERANCE) + 1
         grid = sample_period * np.arange(count)
         stamps = np.linspace(0.0, self.duration, len(self)) if self.uniform else self.time - self.time[0]
         place = np.round(np.interp(grid, stamps, np.arange(len(self))), 6)  # in samples
+        unknown = (place % 1 > 0) & np.append(gaps, False)[place.astype(int)]
         hold = _hold_last if self.hold == "zero" else _interpolate
         return replace(
             self,
             time=self.time[0] + grid,
             inputs={name: hold(values, place) for name, values in self.inputs.items()},
-            outputs={name: _interpolate(values, place) for name, values in self.outputs.items()},
+            outputs={
+                name: np.where(unknown, np.nan, _interpolate(values, place)) for name, values in self.outputs.items()
+            },
             uniform=True,
         )
 
@@ -146,9 +161,14 @@ class Record:
         """Keep the named outputs only, in the order given, and all inputs; ValueError for an unknown name."""
         if isinstance(outputs, str):
             raise TypeError(f"expected a list of output names, got a string: write outputs=[{outputs!r}]")
+        if not isinstance(outputs, Iterable):
+            raise TypeError(f"expected a list of output names, got {shown(outputs)}")
+        outputs = list(outputs)
         for name in outputs:
-            if name not in self.outputs:
+            if not isinstance(name, str) or name not in self.outputs:
                 raise unknown_name("output", name, self.outputs, f"record {self.name!r}")
+            if outputs.count(name) > 1:
+                raise ValueError(f"output {name!r} is named {outputs.count(name)} times: name it once")
         return replace(self, outputs={name: self.outputs[name] for name in outputs})
 
     def to_dataframe(self) -> "pandas.DataFrame":
@@ -197,7 +217,46 @@ class Record:
         Columns, their conversion and errors as in `from_dataframe`; `name` is by default the file's.
         """
         signals = pick(csv_table(path, **read_csv), str(path), time=time, inputs=inputs, outputs=outputs)
-        return cls(*signals, hold, name or Path(path).stem, uniform)
+        return cls(*signals, hold, Path(path).stem if name is None else name, uniform)
+
+    @classmethod
+    def from_excel(
+        cls,
+        path: str | PathLike[str],
+        *,
+        time: str | Column | float,
+        inputs: Mapping[str, str | Column],
+        outputs: Mapping[str, str | Column],
+        hold: Literal["zero", "linear"] = "zero",
+        name: str | None = None,
+        uniform: bool = True,
+        **read_excel: Any,
+    ) -> "Record":
+        """Read a sheet of an Excel workbook with a header; other keywords go to `pandas.read_excel`. Needs openpyxl.
+
+        Columns, their conversion and errors as in `from_dataframe`; `name` is by default the file's.
+        """
+        signals = pick(excel_table(path, **read_excel), str(path), time=time, inputs=inputs, outputs=outputs)
+        return cls(*signals, hold, Path(path).stem if name is None else name, uniform)
+
+    @classmethod
+    def from_parquet(
+        cls,
+        path: str | PathLike[str],
+        *,
+        time: str | Column | float,
+        inputs: Mapping[str, str | Column],
+        outputs: Mapping[str, str | Column],
+        hold: Literal["zero", "linear"] = "zero",
+        name: str | None = None,
+        uniform: bool = True,
+    ) -> "Record":
+        """Read columns of a parquet file by name. Needs pyarrow.
+
+        Columns, their conversion and errors as in `from_dataframe`; `name` is by default the file's.
+        """
+        signals = pick(parquet_table(path), str(path), time=time, inputs=inputs, outputs=outputs)
+        return cls(*signals, hold, Path(path).stem if name is None else name, uniform)
 
     @classmethod
     def from_npz(
@@ -215,9 +274,8 @@ class Record:
 
         Columns, their conversion and errors as in `from_dataframe`; `name` is by default the file's.
         """
-        with open_npz(path) as table:
-            signals = pick(table, str(path), time=time, inputs=inputs, outputs=outputs)
-        return cls(*signals, hold, name or Path(path).stem, uniform)
+        signals = pick(npz_table(path), str(path), time=time, inputs=inputs, outputs=outputs)
+        return cls(*signals, hold, Path(path).stem if name is None else name, uniform)
 
     @classmethod
     def from_mat(
@@ -231,12 +289,12 @@ class Record:
         name: str | None = None,
         uniform: bool = True,
     ) -> "Record":
-        """Read vectors of a MATLAB file (-v7 or older) by name; `data.position` is a field of a struct.
+        """Read vectors of a MATLAB file by name; `data.position` is a field of a struct. -v7.3 needs h5py.
 
         Columns, their conversion and errors as in `from_dataframe`; `name` is by default the file's.
         """
         signals = pick(mat_table(path), str(path), time=time, inputs=inputs, outputs=outputs)
-        return cls(*signals, hold, name or Path(path).stem, uniform)
+        return cls(*signals, hold, Path(path).stem if name is None else name, uniform)
 
     def __repr__(self) -> str:
         """Give the name, the samples and the range of every signal."""
@@ -259,7 +317,9 @@ class Record:
         return f"{self.time[0]:.6g} to {self.time[-1]:.6g} s"
 
     def _sample_from(self, bound: float) -> int:
-        return int(np.searchsorted(self.time, bound - _TOLERANCE * np.diff(self.time).min()))
+        if not is_real(bound):
+            raise TypeError(f"expected a time in s to cut {self.name!r} at ({self._span()}), got {shown(bound)}")
+        return int(np.searchsorted(self.time, bound - TOLERANCE * np.diff(self.time).min()))
 
     def _cut(self, first: int, last: int) -> "Record":
         if last - first < 2:
@@ -275,95 +335,25 @@ class Record:
         )
 
 
-def _check_hold(hold: Any) -> None:
-    if hold not in ("zero", "linear"):
-        raise ValueError(f"expected hold='zero' or hold='linear', got {hold!r}")
+def _gaps(time: np.ndarray) -> np.ndarray:
+    """Which steps of the time stamps are longer than two usual ones, with half a step for jitter; [time - 1]."""
+    steps = np.diff(time)
+    return steps > 2.5 * np.median(steps)
 
 
-def _check_names(inputs: Any, outputs: Any) -> None:
-    for kind, signals in (("inputs", inputs), ("outputs", outputs)):
-        if not isinstance(signals, Mapping):
-            raise TypeError(f"expected {kind} as a mapping from name to values, got {type(signals).__name__}")
-        for name in signals:
-            if not isinstance(name, str) or not name:
-                raise TypeError(f"expected names of {kind} that are strings and not empty, got {name!r}")
-            if name == "time":
-                raise ValueError(f"'time' cannot be one of the {kind}: time is given apart, rename the signal")
-    for name in inputs:
-        if name in outputs:
-            raise ValueError(f"signal {name!r} is both an input and an output: rename one or leave it out")
-
-
-def _check_time(time: np.ndarray) -> None:
-    if len(time) < 2:
-        raise ValueError("time has 1 sample: a record needs at least 2, pass a longer one")
-    unknown_time = ~np.isfinite(time)
-    if unknown_time.any():
-        row = _first(unknown_time)
-        raise ValueError(f"time is {time[row]} at sample {row}: remove the row or fill in its time")
-    standing = np.diff(time) <= 0
-    if standing.any():
-        row = _first(standing) + 1
-        raise ValueError(
-            f"time does not increase at sample {row} ({time[row]:.9g} s after {time[row - 1]:.9g} s): "
-            "sort the rows by time and remove repeated ones"
-        )
-
-
-def _check_uniform(time: np.ndarray) -> None:
-    period = (time[-1] - time[0]) / (len(time) - 1)
-    straying = np.abs(time - np.linspace(time[0], time[-1], len(time))).max() / period
-    if straying > _TOLERANCE:
-        steps = np.diff(time)
-        usual = np.median(steps)
-        row = int(np.argmax(np.abs(steps - usual))) + 1
-        raise ValueError(
-            f"time is not uniform, it strays from a straight line by {straying:.2g} periods: sample {row} "
-            f"comes {steps[row - 1]:.9g} s after sample {row - 1}, where {usual:.9g} s is usual; use "
-            f"Record(..., uniform=False).resample({usual:.6g}), or even time if only its stamps are poor"
-        )
-
-
-def _check_length(label: str, values: np.ndarray, time: np.ndarray) -> None:
-    if len(values) != len(time):
-        raise ValueError(
-            f"{label} has {len(values)} samples but time has {len(time)}: one of them ends before sample "
-            f"{min(len(values), len(time))}, give both the same rows"
-        )
-
-
-def _check_input(label: str, values: np.ndarray) -> None:
-    if np.isnan(values).all():
-        raise ValueError(f"{label} is empty, all {len(values)} samples are NaN: check the name of its column")
-    bad = ~np.isfinite(values)
-    if bad.any():
-        row = _first(bad)
-        raise ValueError(
-            f"{label} is {values[row]} at sample {row}: an input must be known throughout, fill the gap or cut it out"
-        )
-
-
-def _check_output(label: str, values: np.ndarray) -> None:
-    if np.isinf(values).any():
-        row = _first(np.isinf(values))
-        raise ValueError(f"{label} is {values[row]} at sample {row}: set it to NaN if the sample is missing")
-    present = np.flatnonzero(~np.isnan(values))
-    if present.size == 0:
-        raise ValueError(f"{label} is empty, all {len(values)} samples are NaN: leave it out or check its column")
-    measured = values[present]
-    if measured.min() == measured.max():
-        raise ValueError(
-            f"{label} never changes, it is {measured[0]:.9g} from sample {present[0]} to {present[-1]}: "
-            "leave it out, or take a longer part of the record"
-        )
-
-
-def _first(mask: np.ndarray) -> int:
-    return int(np.argmax(mask))
+def _unknown_inputs(name: str, time: np.ndarray, gaps: np.ndarray) -> str:
+    row = int(np.argmax(gaps))
+    more = f" (one of {gaps.sum()} gaps)" if gaps.sum() > 1 else ""
+    return (
+        f"the inputs of {name!r} are unknown from {time[row]:.9g} to {time[row + 1]:.9g} s, a gap{more} where "
+        f"{np.median(np.diff(time)):.6g} s from row to row is usual: slice it there and resample each part (identify "
+        "takes a list of records), or say resample(..., inputs_known_in_gaps=True) if they kept to their hold, as a "
+        "command does that is logged when it changes"
+    )
 
 
 def _hold_last(values: np.ndarray, place: np.ndarray) -> np.ndarray:
-    return values[np.floor(place + _TOLERANCE).astype(int)]
+    return values[np.floor(place + TOLERANCE).astype(int)]
 
 
 def _interpolate(values: np.ndarray, place: np.ndarray) -> np.ndarray:
