@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.effects.effect import length_unit
 from ehsvjax.models.model import Model
 
 # Straight pieces of a curve in the tests. Along an output a term may repeat over short distances: there it is also
@@ -249,5 +250,5 @@ def quantity_unit(model: Model, name: str) -> str:
     units = {TIME: "s"} | {s.name: s.unit for s in model.signals}
     # A dimensionless model has no units but that of time.
     if model.unit(model.outputs[0]):
-        units = {"velocity": "m/s", "flow": "m^3/s", "load_force": "N"} | units
+        units = {"velocity": f"{length_unit(model)}/s", "flow": "m^3/s", "load_force": "N"} | units
     return units.get(name, "")

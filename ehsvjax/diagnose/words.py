@@ -95,7 +95,8 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             f"{name} {value:.4g}{_spaced(diagnosis.extended.model.parameter(f'{row.cause}.{name}').unit)}"
             for name, value in numbers.items()
         )
-        lines.append(f"{row.cause} at {row.signal}: {said}; without it {row.likelihood_gain:.4g} noise variances worse")
+        what = _instead(diagnosis, str(row.cause), numbers) or f"{row.cause} at {row.signal}: {said}"
+        lines.append(f"{what}; without it the sum of squares is {row.likelihood_gain:.4g} noise variances more")
     if diagnosis.process_noise is not None:
         place, intensity, *_ = diagnosis.process_noise
         unit = diagnosis.fit.model.unit(place)
@@ -117,6 +118,15 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
             lines.append(f"a term {others} would explain as much")
     return lines
+
+
+def _instead(diagnosis: "Diagnosis", cause: str, numbers: dict[str, float]) -> str | None:
+    """Return what a constant is instead of what was given; None for any other cause."""
+    given = next((p for p in diagnosis.fit.model.parameters if p.name == cause), None)
+    if given is None or not numbers:
+        return None
+    found = given.value * (1.0 + numbers["error"]) if "error" in numbers else numbers["value"]
+    return f"{cause}: {found:.4g}{_spaced(given.unit)} instead of the {given.value:.4g} that was given"
 
 
 def gain_lines(diagnosis: "Diagnosis") -> list[str]:

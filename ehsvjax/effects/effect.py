@@ -32,7 +32,7 @@ class EffectParameter(NamedTuple):
 
     Attributes:
         name: in the field's terms, `coefficient`.
-        unit: SI; `{value}` in it stands for the unit of the signal.
+        unit: SI; `{value}` in it stands for the unit of the signal, `{length}` for that of the model's position.
         absent: the value with which the effect is not there, if this parameter makes it vanish: 0 for an amplitude,
             `UNLIMITED` for a limit; None for a shape (a frequency, a width) that means nothing without the amplitude.
         lower, upper: the least and the largest value that make sense, from the scales; an amplitude with a lower bound
@@ -150,8 +150,19 @@ class Candidate(NamedTuple):
         """Unit of one of the effect's numbers; none where the model is dimensionless at the signal."""
         at_parameter = self.effect.kind in ("parameter", "constant")
         unit = model.parameter(self.signal).unit if at_parameter else model.unit(self.signal)
-        found = "" if "{value}" in number.unit and not unit else number.unit.replace("{value}", unit)
+        if "{value}" in number.unit and not unit:
+            return ""
+        found = number.unit.replace("{value}", unit).replace("{length}", length_unit(model))
         return found.replace("/s s", "")
+
+
+def length_unit(model: Model) -> str:
+    """Unit in which a model counts its position: that of the signal of this name, or of all its sensors."""
+    units = {s.unit for s in model.signals if s.name == "position"} or {
+        s.unit for s in model.signals if s.kind == "sensor"
+    }
+    unit = next(iter(units)) if len(units) == 1 else "m"
+    return unit if unit.isalnum() or not unit else f"({unit})"
 
 
 def candidates(

@@ -75,7 +75,7 @@ def _stribeck_shape(scales: Scales):
 def _stribeck_parameters(unit):
     return (
         size("force", unit, _probe),
-        shape("velocity", "m/s", _stribeck_shape, lambda s: 1e-3 * s["velocity"], lambda s: 0.5 * s["velocity"]),
+        shape("velocity", "{length}/s", _stribeck_shape, lambda s: 1e-3 * s["velocity"], lambda s: 0.5 * s["velocity"]),
     )
 
 
@@ -93,11 +93,11 @@ def _stop(side):
         return side * own[stiffness] * depth
 
     position = EffectParameter(
-        end, "m", UNLIMITED, lambda s: 0.02 * s[reach], lambda s: 1.02 * s[reach],
+        end, "{length}", UNLIMITED, lambda s: 0.02 * s[reach], lambda s: 1.02 * s[reach],
         lambda s: [t * s[reach] for t in (0.98, 0.9, 0.75)],
     )  # fmt: skip
     hardness = shape(
-        stiffness, "N/m", lambda s: _STOP_STIFFNESS, lambda s: _SOFTEST, lambda s: _STIFFEST
+        stiffness, "{value}/{length}", lambda s: _STOP_STIFFNESS, lambda s: _SOFTEST, lambda s: _STIFFEST
     )  # fmt: skip
     return _load(
         "end_stop",
@@ -166,14 +166,14 @@ LOAD = (
     ),
     _load(
         "viscous_friction",
-        (size("coefficient", "{value}/(m/s)", _per("velocity", 1)),),
+        (size("coefficient", "{value}/({length}/s)", _per("velocity", 1)),),
         _viscous,
         says="friction in proportion to velocity",
         settled_by="measure the supply or the load pressure",
     ),
     _load(
         "hardening_spring",
-        (amplitude("coefficient", "{value}/m^3", _per("position", 3)),),
+        (amplitude("coefficient", "{value}/{length}^3", _per("position", 3)),),
         _cubic,
         says="the load's spring becomes stiffer with its stroke",
         settled_by=f"{_MEASURE_PRESSURE} at several positions",
@@ -216,7 +216,7 @@ FORCE = (
     ),
     _force(
         "linear_damping",
-        (amplitude("coefficient", "{value}/(m/s)", _per("velocity", 1)),),
+        (amplitude("coefficient", "{value}/({length}/s)", _per("velocity", 1)),),
         _viscous,
         needs=("velocity",),
         says="a force in proportion to velocity",
@@ -224,7 +224,7 @@ FORCE = (
     ),
     _force(
         "quadratic_damping",
-        (amplitude("coefficient", "{value}/(m/s)^2", _per("velocity", 2)),),
+        (amplitude("coefficient", "{value}/({length}/s)^2", _per("velocity", 2)),),
         lambda own, context: own["coefficient"] * context["velocity"] * jnp.abs(context["velocity"]),
         needs=("velocity",),
         says="drag in proportion to the square of velocity",
@@ -232,7 +232,7 @@ FORCE = (
     ),
     _force(
         "rayleigh_damping",
-        (amplitude("coefficient", "{value}/(m/s)^3", _per("velocity", 3)),),
+        (amplitude("coefficient", "{value}/({length}/s)^3", _per("velocity", 3)),),
         lambda own, context: own["coefficient"] * context["velocity"] ** 3,
         needs=("velocity",),
         says="a force in proportion to the cube of velocity",
@@ -240,7 +240,7 @@ FORCE = (
     ),
     _force(
         "linear_stiffness",
-        (amplitude("coefficient", "{value}/m", _per("position", 1)),),
+        (amplitude("coefficient", "{value}/{length}", _per("position", 1)),),
         lambda own, context: own["coefficient"] * context["position"],
         needs=("position",),
         says="a spring more or less",
@@ -248,7 +248,7 @@ FORCE = (
     ),
     _force(
         "quadratic_stiffness",
-        (amplitude("coefficient", "{value}/m^2", _per("position", 2)),),
+        (amplitude("coefficient", "{value}/{length}^2", _per("position", 2)),),
         lambda own, context: own["coefficient"] * context["position"] ** 2,
         needs=("position",),
         says="a spring that is stiffer on one side",
@@ -256,7 +256,7 @@ FORCE = (
     ),
     _force(
         "cubic_stiffness",
-        (amplitude("coefficient", "{value}/m^3", _per("position", 3)),),
+        (amplitude("coefficient", "{value}/{length}^3", _per("position", 3)),),
         _cubic,
         needs=("position",),
         says="a spring that becomes stiffer with its stroke, by the third power",
@@ -264,7 +264,7 @@ FORCE = (
     ),
     _force(
         "quintic_stiffness",
-        (amplitude("coefficient", "{value}/m^5", _per("position", 5)),),
+        (amplitude("coefficient", "{value}/{length}^5", _per("position", 5)),),
         lambda own, context: own["coefficient"] * context["position"] ** 5,
         needs=("position",),
         says="a spring that becomes stiffer with its stroke, by the fifth power",
@@ -280,7 +280,7 @@ FORCE = (
     ),
     _force(
         "parametric_excitation",
-        harmonic_parameters("{value}/m", _per("position", 1)),
+        harmonic_parameters("{value}/{length}", _per("position", 1)),
         lambda own, context: -harmonic(own, context) * context["position"],
         needs=("position",),
         says="a stiffness that changes periodically",
