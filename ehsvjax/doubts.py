@@ -8,14 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax.arithmetic import outputs_of
 from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit, at_bound
 from ehsvjax.models.model import Model
-from ehsvjax.population import Problem, cast, residuals
+from ehsvjax.population import Problem
 from ehsvjax.record import Record
 from ehsvjax.simulate import grid_of, simulate
 from ehsvjax.unknowns import guess_noise_variance
@@ -139,12 +138,10 @@ def _about_search(model: Model, problem: Problem, individual, effort: Effort) ->
 def residuals_at(
     problem: Problem, individual: Float[np.ndarray, " parameter"]
 ) -> Float[np.ndarray, "record time signal"]:
-    """Return the standardised residuals of one individual of the unit cube, in float64."""
-    with jax.enable_x64(True):
-        return np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
-
-
-_residuals = jax.jit(residuals)
+    """Return the standardised residuals of one individual of the unit cube, in float64; zero where nothing counts."""
+    samples = problem.samples
+    off = (samples.outputs - outputs_of(problem, individual)) / np.sqrt(problem.noise_variance)
+    return np.where(samples.measured, off, 0.0)
 
 
 def _variance(readings: Sequence[Float[np.ndarray, " time"]], robust: bool) -> float:

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.fit import Fit, checked_record
+from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.precision.standard_errors import quantile_of
-from ehsvjax.record import Record
+from ehsvjax.record import Record, checked_record
 from ehsvjax.summary import NOT_FINITE, percent_of_fit
 
 if TYPE_CHECKING:
