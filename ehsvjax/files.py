@@ -34,12 +34,7 @@ def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
         OSError: for what else the system refuses, with the name of the path.
 
     """
-    # A link stays a link: the file that it points to is replaced.
-    target = Path(file_path("path", path)).resolve()
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"expected the folder of {path} to be there, got none: make {target.parent} first")
-    if target.is_dir():
-        raise IsADirectoryError(f"expected {path} to be a file to write, got a folder: name a file in it")
+    target = place_to_write("path", path)
     if target.exists() and not target.is_file():
         with open(target, "wb") as file:
             yield file
@@ -60,6 +55,23 @@ def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
                 error, path, "written", "look at its folder and at the room on its disk"
             ) from None
         raise
+
+
+def place_to_write(name: str, path: str | os.PathLike) -> Path:
+    """Return where a file would be written: a link stays a link, the file that it points to is replaced.
+
+    Raises:
+        ValueError: if it is no path; `name` says of what.
+        FileNotFoundError: if the folder is not there.
+        IsADirectoryError: if it is a folder.
+
+    """
+    target = Path(file_path(name, path)).resolve()
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"expected the folder of {path} to be there, got none: make {target.parent} first")
+    if target.is_dir():
+        raise IsADirectoryError(f"expected {path} to be a file to write, got a folder: name a file in it")
+    return target
 
 
 @contextmanager

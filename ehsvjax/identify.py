@@ -13,9 +13,10 @@ from jaxtyping import Array, Key
 
 from ehsvjax import doubts, genetic
 from ehsvjax.arithmetic import arithmetic_at, settled_at
-from ehsvjax.checks import file_path, flag, instance, number, refused, whole
+from ehsvjax.checks import flag, instance, number, refused, whole
 from ehsvjax.draws import check_key
 from ehsvjax.failure import nothing_finite
+from ehsvjax.files import place_to_write
 from ehsvjax.fit import Effort, Fit, History
 from ehsvjax.genetic import Operators
 from ehsvjax.models.model import Model
@@ -97,6 +98,7 @@ def identify(
     Raises:
         ValueError: for anything that cannot be meant, before a simulation is run; and if every simulation fails, with
             what fails first and what to look at.
+        OSError: if the checkpoint cannot be read or written.
 
     """
     records = checked_records(records)
@@ -191,7 +193,7 @@ def _check_call(model, key, operators, tolerance, checkpoint, **flags):
     instance("operators", operators, Operators, "take ehsvjax.Operators(...)")
     number("tolerance", tolerance, "zero or more noise variances", lambda x: x >= 0.0, "0.01 is usual, 0 never stops")
     if checkpoint is not None:
-        file_path("checkpoint", checkpoint)
+        place_to_write("checkpoint", checkpoint)
     for name, value in flags.items():
         flag(name, value)
 

@@ -94,6 +94,8 @@ IDENTIFY = [
     ({"devices": 2}, "expected devices to be some of jax.devices(), got"),
     ({"devices": []}, "expected devices to be some of jax.devices(), got"),
     ({"checkpoint": 5}, "expected checkpoint to be the path of a file, got 5"),
+    ({"checkpoint": ROOT / "nowhere" / "run"}, "expected the folder of"),
+    ({"checkpoint": ROOT}, "to be a file to write, got a folder: name a file in it"),
     ({"checkpoint": ""}, "expected checkpoint to be the path of a file, got ''"),
 ]
 
@@ -218,7 +220,9 @@ def answers():
 @pytest.mark.parametrize("i", range(len(CALLS) - 1))
 def test_a_wrong_call_is_answered_in_one_sentence_before_anything_is_traced(i, answers):
     words = CALLS[i][1]
-    assert answers[i].startswith("ValueError: expected ") and words in answers[i]
+    kind, _, sentence = answers[i].partition(": ")
+    assert kind in ("ValueError", "FileNotFoundError", "IsADirectoryError")
+    assert sentence.startswith("expected ") and words in sentence
     assert "\n" not in answers[i]
 
 
