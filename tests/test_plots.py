@@ -151,7 +151,7 @@ def _with_hostile_names():
     def measure(parameters, state, inputs, signal):
         plain = {name.split()[0]: value for name, value in parameters.items()}
         given = {name.split()[0]: value for name, value in inputs.items()}
-        outputs = model.measure(plain, state, given, signal)
+        outputs = model.measure(plain, state, given, lambda name, value: signal(f"{name} {_HOSTILE}", value))
         return {f"{name} {_HOSTILE}": value for name, value in outputs.items()}
 
     def start(parameters, initial, inputs):
