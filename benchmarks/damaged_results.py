@@ -128,6 +128,7 @@ def of_fits() -> Iterator[Call]:
         yield from damaged(f"Fit.{method}", getattr(fit, method), {"record": (record, optional), **new})
     noise, level = {"noise": ("white", CHOICE)}, {"level": (0.95, SHARE | {"zero": 0.0, "one": 1.0})}
     yield from damaged("Fit.precision", fit.precision, noise)
+    yield from damaged("Precision.intervals", fit.precision().intervals, level)
     names = {"text": "gain", "number": 3.0, "numbers": [1.0], "unknown": ["nobody"], "empty": [], "object": object()}
     yield from damaged("Fit.profile_likelihood", fit.profile_likelihood, {"names": (["gain"], names), **level, **noise})
     yield from damaged("Fit.bootstrap", fit.bootstrap, {
@@ -141,7 +142,7 @@ def of_fits() -> Iterator[Call]:
     yield from damaged("Fit.load", ehsvjax.Fit.load,
         {"path": (folder / "fit.npz", PATH | {"None": None}), "model": (model, THING)})  # fmt: skip
     for wrong, argument in ((THING, "fit"), (THING, "record"), (without(THING, "None"), "validation"), (KEY, "key"),
-                            (THING, "bank"), (FLAG, "progress")):  # fmt: skip
+                            (THING, "bank"), (without(FLAG, "None"), "progress")):  # fmt: skip
         right = {"fit": fit, "record": record, "validation": None, "key": jax.random.key(0), "bank": effects.BANK}
         for label, value in wrong.items():
             yield Call(

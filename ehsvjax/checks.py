@@ -4,19 +4,22 @@ Each function returns the argument as it is meant, or raises ValueError: "expect
 """
 
 import math
-import reprlib
+import os
 from collections.abc import Callable, Collection, Mapping
-from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 
 def refused(name: str, wanted: str, value: Any, remedy: str = "") -> ValueError:
     """Return the error that says what was expected, what came instead, and what to do."""
-    shown = " ".join(reprlib.repr(value).split())
-    return ValueError(f"expected {name} to be {wanted}, got {shown}" + (f": {remedy}" if remedy else ""))
+    return ValueError(f"expected {name} to be {wanted}, got {shown(value)}" + (f": {remedy}" if remedy else ""))
+
+
+def shown(value: Any) -> str:
+    """Return a value as it is written in a sentence: in one line, its first 80 characters."""
+    words = " ".join(repr(value).split())
+    return f"{words[:80]} ..." if len(words) > 80 else words
 
 
 def number(
@@ -59,11 +62,10 @@ def positive(name: str, value: Any, remedy: str = "give a number above 0") -> fl
         ValueError: for anything else.
 
     """
-    number(name, value, remedy="give it in SI units")
     return number(name, value, "positive", lambda value: value > 0.0, remedy)
 
 
-def whole(name: str, value: Any, least: int, most: int, remedy: str = "") -> int:
+def whole(name: str, value: Any, least: int, most: float = math.inf, remedy: str = "give one, such as 10") -> int:
     """Return a whole number from `least` to `most`; one whose type is a floating-point one is none.
 
     Raises:
@@ -72,7 +74,8 @@ def whole(name: str, value: Any, least: int, most: int, remedy: str = "") -> int
     """
     is_whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not (is_whole and least <= value <= most):
-        raise refused(name, f"a whole number from {least} to {most:g}", value, remedy)
+        reach = f"of at least {least}" if most == math.inf else f"from {least} to {most:g}"
+        raise refused(name, f"a whole number {reach}", value, remedy)
     return int(value)
 
 
@@ -96,7 +99,8 @@ def choice(name: str, value: Any, choices: Collection[str]) -> str:
 
     """
     if not isinstance(value, str) or value not in choices:
-        raise refused(name, " or ".join(map(repr, choices)), value, "choose one")
+        *others, last = map(repr, choices)
+        raise refused(name, f"{', '.join(others)} or {last}", value, "choose one")
     return value
 
 
@@ -126,8 +130,20 @@ def label(name: str, value: Any) -> str:
     return value
 
 
+def file_path(name: str, value: Any, what: str = "a file") -> str | os.PathLike:
+    """Return the path of a file, there or not; `what` is in it.
+
+    Raises:
+        ValueError: for anything else.
+
+    """
+    if not isinstance(value, str | os.PathLike) or not os.fspath(value) or "\0" in str(value):
+        raise refused(name, f"the path of {what}", value, "give a string or a pathlib.Path")
+    return value
+
+
 def function(name: str, value: Any, form: str) -> Callable:
-    """Return a function; `form` says how it is called.
+    """Return a function by which compiled programs can be kept; `form` says how it is called.
 
     Raises:
         ValueError: for anything else.
@@ -135,6 +151,11 @@ def function(name: str, value: Any, form: str) -> Callable:
     """
     if not callable(value):
         raise refused(name, f"a function, {form}", value, "pass the function itself")
+    try:
+        hash(value)
+    except TypeError:
+        remedy = "compiled programs are kept by it; use functions, or frozen dataclasses"
+        raise refused(name, "something with a hash", value, remedy) from None
     return value
 
 
@@ -146,7 +167,8 @@ def instance(name: str, value: Any, kind: type, remedy: str) -> Any:
 
     """
     if not isinstance(value, kind):
-        raise refused(name, f"a {kind.__name__}", value, remedy)
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise refused(name, f"{article} {kind.__name__}", value, remedy)
     return value
 
 
@@ -178,44 +200,24 @@ def by_name(name: str, values: Any, example: str) -> dict[str, Any]:
     return dict(values)
 
 
-def same_structure(name: str, found: Any, whose: str, wanted: Any) -> None:
-    """Refuse what a function returned if it has not the keys of something else, in the same structure.
+def fits_memory(name: str, sizes: str, needed: float) -> None:
+    """Refuse what would take more bytes than this machine has; `sizes` says which arguments make it so.
 
     Raises:
-        ValueError: with both structures.
+        ValueError: with both numbers.
 
     """
-    numeric = all(map(is_numeric, jax.tree.leaves(found)))
-    if not numeric or str(jax.tree.structure(found)) != str(jax.tree.structure(wanted)):
-        remedy = "return the same keys in the same structure, with a number for each"
-        raise ValueError(f"expected {name} to be like {whose}, {in_words(wanted)}, got {in_words(found)}: {remedy}")
+    memory = _memory()
+    if needed > memory:
+        raise ValueError(
+            f"expected {name} that fits into this machine's memory of {memory / 1e9:.3g} GB, got {sizes}, which takes "
+            f"{needed / 1e9:.3g} GB: take fewer"
+        )
 
 
-def in_words(tree: Any) -> str:
-    """Return the structure of a pytree, with what is in it: numbers, arrays of a shape, or other things."""
-
-    def words(leaf):
-        if not is_numeric(leaf):
-            return _Words(f"a {type(leaf).__name__}")
-        return _Words(f"an array {np.shape(leaf)}" if np.shape(leaf) else "a number")
-
-    return str(jax.tree.map(words, tree))
-
-
-def is_numeric(value: Any) -> bool:
-    """Return whether a value is a number or an array of numbers, traced or not."""
-    kind = getattr(getattr(value, "dtype", None), "kind", None)
-    return isinstance(value, int | float | complex) if kind is None else kind in "biufc"
-
-
-class _Words(str):
-    """Text that is printed without quotes."""
-
-    __repr__ = str.__str__
-
-
-def name_of(equation: Callable) -> str:
-    """Return how a person knows a function: its name, and where it is defined."""
-    code = getattr(equation, "__code__", None)
-    name = getattr(equation, "__qualname__", type(equation).__name__)
-    return f"{name} ({Path(code.co_filename).name}, line {code.co_firstlineno})" if code else name
+def _memory() -> float:
+    """Return the memory of this machine in bytes; +inf where the system does not say."""
+    try:
+        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    except (AttributeError, OSError, ValueError):
+        return math.inf

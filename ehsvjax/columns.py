@@ -6,12 +6,13 @@ A table is a mapping from column name to raw values, or to a function that reads
 
 import difflib
 from collections.abc import Collection, Mapping
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ehsvjax.checks import as_number, shown
 from ehsvjax.clock import seconds_of
 from ehsvjax.files import reason_of
 
@@ -56,8 +57,9 @@ def pick(
             raise TypeError(f"expected {kind} as a mapping from signal name to column, got {shown(columns)}")
     input_values = {name: _si_values(table, source, column) for name, column in inputs.items()}
     output_values = {name: _si_values(table, source, column) for name, column in outputs.items()}
-    if is_real(time):
-        return Signals(_counted(time, input_values | output_values), input_values, output_values)
+    period = as_number(time)
+    if period is not None:
+        return Signals(_counted(period, input_values | output_values), input_values, output_values)
     return Signals(_si_values(table, source, time, is_time=True), input_values, output_values)
 
 
@@ -80,19 +82,6 @@ def vector(label: str, values: ArrayLike) -> Float[np.ndarray, " time"]:
     if array.ndim != 1:
         raise ValueError(f"{label} has shape {array.shape}: expected 1-D, one number per sample; pass one column")
     return array.astype(np.float64)
-
-
-def is_real(value: Any) -> TypeGuard[float]:
-    """Whether it is one real number that a float can hold, which True and 10**400 are not."""
-    if isinstance(value, int) and (isinstance(value, bool) or value.bit_length() > 1023):
-        return False
-    return isinstance(value, int | float | np.integer | np.floating)
-
-
-def shown(value: Any) -> str:
-    """The value as it is written in a sentence: in one line, its first 80 characters."""
-    words = " ".join(repr(value).split())
-    return f"{words[:80]} ..." if len(words) > 80 else words
 
 
 def unknown_name(kind: str, name: str, known: Collection[str], source: str = "", remedy: str = "") -> ValueError:
@@ -123,7 +112,7 @@ def _si_values(table: Mapping[str, Any], source: str, column: Any, is_time: bool
     if not isinstance(column, str | Column):
         raise TypeError(f"expected a column name or a Column(name, scale, offset), got {shown(column)}")
     name, scale, offset = Column(column) if isinstance(column, str) else column
-    if not (isinstance(name, str) and is_real(scale) and is_real(offset)):
+    if not (isinstance(name, str) and None not in (as_number(scale), as_number(offset))):
         raise TypeError(f"expected a name, a scale and an offset (a string and two numbers), got {shown(column)}")
     if name not in table:
         remedy = other_separator(next(iter(table))) if len(table) == 1 else ""

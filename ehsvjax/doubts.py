@@ -8,14 +8,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax.arithmetic import outputs_of
 from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit, at_bound
 from ehsvjax.models.model import Model
-from ehsvjax.population import Problem, cast, residuals
+from ehsvjax.population import Problem
 from ehsvjax.record import Record
 from ehsvjax.simulate import grid_of, simulate
 from ehsvjax.unknowns import guess_noise_variance
@@ -26,6 +25,8 @@ _NOTHING, _MOST = 0.1, 0.5
 _NOISE = 2.0
 # Integration steps between two samples over which what a model does is long over.
 _STEPS = 1000
+# Noise variances that the integration may be worth before a comparison of two fits rests on it.
+_ONE_READING = 1.0
 NO_CHANGE = 1e-6
 """Changes of the sum of squares, in noise variances, that are none."""
 _DECADES = (1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4)
@@ -64,8 +65,21 @@ def about_fit(
     """
     return (
         *_about_outputs(fit, dict(zip(problem.observed, residual_variance.tolist(), strict=True))),
+        *about_arithmetic(fit.model, fit.effort),
         *_about_unknowns(fit.model, problem, individual, idle),
         *_about_search(fit.model, problem, individual, fit.effort),
+    )
+
+
+def about_arithmetic(model: Model, effort: Effort) -> tuple[str, ...]:
+    """Doubt a fit of which the integration's own error is worth more than the noise of one reading."""
+    if effort.arithmetic is None or effort.arithmetic <= _ONE_READING:
+        return ()
+    finite = np.isfinite(effort.arithmetic)
+    worth = f"{effort.arithmetic:.2g} noise variances" if finite else "more than can be said"
+    return (
+        f"the integration of {model.name} is off by {worth}, at steps of {effort.step_size:.3g} s: use a smaller "
+        "max_step, dataclasses.replace(model, max_step=...), or a method for stiff equations",
     )
 
 
@@ -139,12 +153,10 @@ def _about_search(model: Model, problem: Problem, individual, effort: Effort) ->
 def residuals_at(
     problem: Problem, individual: Float[np.ndarray, " parameter"]
 ) -> Float[np.ndarray, "record time signal"]:
-    """Return the standardised residuals of one individual of the unit cube, in float64."""
-    with jax.enable_x64(True):
-        return np.asarray(_residuals(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
-
-
-_residuals = jax.jit(residuals)
+    """Return the standardised residuals of one individual of the unit cube, in float64; zero where nothing counts."""
+    samples = problem.samples
+    off = (samples.outputs - outputs_of(problem, individual)) / np.sqrt(problem.noise_variance)
+    return np.where(samples.measured, off, 0.0)
 
 
 def _variance(readings: Sequence[Float[np.ndarray, " time"]], robust: bool) -> float:

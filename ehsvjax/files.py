@@ -3,7 +3,8 @@
     with reading(path, "a MATLAB file", "save it again with '-v7'"):
         variables = loadmat(path)
 
-Only the library's calls belong inside; what the package itself refuses in the content is raised after the block.
+Only the library's calls belong inside; what the package itself refuses in the content is raised after the block, as
+`unreadable`: PATH cannot be read as WHAT (REASON): REMEDY.
 """
 
 import importlib
@@ -16,6 +17,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO
 
+from ehsvjax.checks import file_path
+
 
 @contextmanager
 def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
@@ -26,14 +29,12 @@ def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
     ordinary file (a pipe, `/dev/stdout`) is written as it is.
 
     Raises:
+        ValueError: if `path` is no path.
         FileNotFoundError: if the folder is not there.
         OSError: for what else the system refuses, with the name of the path.
 
     """
-    # A link stays a link: the file that it points to is replaced.
-    target = Path(path).resolve()
-    if not target.parent.is_dir():
-        raise FileNotFoundError(f"expected the folder of {path} to be there, got none: make {target.parent} first")
+    target = place_to_write("path", path)
     if target.exists() and not target.is_file():
         with open(target, "wb") as file:
             yield file
@@ -50,8 +51,27 @@ def written_whole(path: str | os.PathLike) -> Iterator[BinaryIO]:
     except BaseException as error:
         beside.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(beside)):
-            error.filename = str(path)
+            raise _refused_by_the_system(
+                error, path, "written", "look at its folder and at the room on its disk"
+            ) from None
         raise
+
+
+def place_to_write(name: str, path: str | os.PathLike) -> Path:
+    """Return where a file would be written: a link stays a link, the file that it points to is replaced.
+
+    Raises:
+        ValueError: if it is no path; `name` says of what.
+        FileNotFoundError: if the folder is not there.
+        IsADirectoryError: if it is a folder.
+
+    """
+    target = Path(file_path(name, path)).resolve()
+    if not target.parent.is_dir():
+        raise FileNotFoundError(f"expected the folder of {path} to be there, got none: make {target.parent} first")
+    if target.is_dir():
+        raise IsADirectoryError(f"expected {path} to be a file to write, got a folder: name a file in it")
+    return target
 
 
 @contextmanager
@@ -59,31 +79,37 @@ def reading(path: str | os.PathLike[str], what: str, remedy: str) -> Iterator[No
     """Run the block that reads the file `path` as `what`, e.g. "a MATLAB file"; `remedy` says what to do if it fails.
 
     Raises:
-        TypeError: if `path` is no path.
+        ValueError: if `path` is no path; for an empty file; and with the library's reason for every error that the
+            block raises: once the file is open, all that can be wrong is in it.
         OSError: of its usual kind (FileNotFoundError, PermissionError, IsADirectoryError), if there is nothing to open.
-        ValueError: for an empty file, and with the library's reason for every error that the block raises: once the
-            file is open, all that can be wrong is in it.
 
     """
-    if not isinstance(path, str | os.PathLike):
-        raise TypeError(f"expected the path of {what}, got {type(path).__name__}: give a string or a pathlib.Path")
+    file_path("path", path, what)
     try:
         with open(path, "rb") as file:
             empty = not file.read(1)
     except OSError as error:
-        reason = (error.strerror or type(error).__name__).lower()
-        raise type(error)(
-            f"{path} cannot be opened ({reason}): check its name and folder, and who may read it; "
-            f"the current folder is {os.getcwd()}"
-        ) from None
-    except ValueError as error:
-        raise ValueError(f"{path!r} is not a path ({error}): give the name of a file") from None
+        remedy = f"check its name and folder, and who may read it; the current folder is {os.getcwd()}"
+        raise _refused_by_the_system(error, path, "opened", remedy) from None
     if empty:
-        raise ValueError(f"{path} is an empty file: check that the export or the download was completed")
+        raise unreadable(path, what, "it is empty", "check that its export, copy or download was completed")
     try:
         yield
     except Exception as error:
-        raise ValueError(f"{path} cannot be read as {what} ({reason_of(error)}): {remedy}") from None
+        raise unreadable(path, what, reason_of(error), remedy) from None
+
+
+def unreadable(path: str | os.PathLike, what: str, reason: str, remedy: str) -> ValueError:
+    """Return the error about what is in a file."""
+    return ValueError(f"{path} cannot be read as {what} ({reason}): {remedy}")
+
+
+def _refused_by_the_system(error: OSError, path: str | os.PathLike, done: str, remedy: str) -> OSError:
+    """Return an error of the same kind that says what could not be done to the file, and what to do."""
+    reason = (error.strerror or type(error).__name__).lower()
+    said = type(error)(f"{path} cannot be {done} ({reason}): {remedy}")
+    said.errno = error.errno
+    return said
 
 
 def reason_of(error: Exception) -> str:

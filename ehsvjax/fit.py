@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.arguments import by_name, instance, number, one_of
+from ehsvjax.checks import by_name, choice, number, refused
 from ehsvjax.failure import warn_of_failure
 from ehsvjax.models.model import Model
-from ehsvjax.record import Record
+from ehsvjax.record import Record, checked_record
 from ehsvjax.score import Score, differences, score_of
 from ehsvjax.simulate import simulate
 
@@ -195,7 +195,7 @@ class Fit:
 
     def score(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> Score:
         """Judge the prediction of one record, fitted or new; arguments and refusals as for `residuals`."""
-        return score_of([record], [self.residuals(record, initial)])
+        return score_of([checked_record(record)], [self.residuals(record, initial)])
 
     @functools.cached_property
     def _score(self) -> Score:
@@ -213,16 +213,16 @@ class Fit:
         checked_record(record)
         nominal = {p.name: p.value for p in self.model.initial}
         if isinstance(initial, Mapping):
-            given = by_name("initial conditions", initial)
+            given = by_name("initial conditions", initial, "{'initial_position': 0.0}")
             for name in given:
                 if name not in nominal:
                     known = ", ".join(nominal) or "none"
                     raise ValueError(
                         f"expected an initial condition of {self.model.name}, got {name!r}; it has {known}"
                     )
-            return nominal | {name: number(name, value) for name, value in given.items()}
-        if initial not in ("estimate", "nominal"):
-            raise ValueError(f"expected initial 'estimate', 'nominal' or values by name, got {initial!r}")
+            return nominal | {name: number(name, v, remedy="give its value, SI") for name, v in given.items()}
+        if not isinstance(initial, str) or initial not in ("estimate", "nominal"):
+            raise refused("initial", "'estimate', 'nominal' or values by name", initial, "choose one")
         if initial == "nominal":
             return nominal
         for fitted, values in zip(self.records, self.initial, strict=True):
@@ -326,7 +326,7 @@ class Fit:
     def _prepared(self, noise: str) -> "Prepared":
         from ehsvjax.precision import of_fit
 
-        one_of("noise", noise, ("auto", "white", "coloured"))
+        choice("noise", noise, ("auto", "white", "coloured"))
         if noise not in self._prepared_by_noise:
             self._prepared_by_noise[noise] = of_fit.prepared(self, noise)
         return self._prepared_by_noise[noise]
@@ -389,13 +389,3 @@ class Fit:
         from ehsvjax.storage import load_fit
 
         return load_fit(path, model, BANK if bank is None else bank)
-
-
-def checked_record(record) -> Record:
-    """Return a record.
-
-    Raises:
-        ValueError: for anything else.
-
-    """
-    return instance("record", record, Record, "make one with Record.from_csv")

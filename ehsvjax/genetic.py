@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ehsvjax import draws
+from ehsvjax.checks import function, number, whole
 from ehsvjax.operators import (
     Crossover,
     Mutation,
@@ -43,6 +44,19 @@ class Operators(NamedTuple):
     mutation: Mutation = gaussian_mutation(0.05)
     elites: int = 2
     immigrants: float = 0.02
+
+
+def check_operators(operators: Operators, population: int) -> None:
+    """Refuse operators that cannot make a generation.
+
+    Raises:
+        ValueError: for what is no function or has no hash, and if elite or immigrants would fill the population.
+
+    """
+    for name in ("selection", "crossover", "mutation"):
+        function(name, getattr(operators, name), f"such as one of ehsvjax.operators for {name}")
+    whole("elites", operators.elites, 1, population - 1, "take fewer than the population")
+    number("immigrants", operators.immigrants, "a share of the population from 0 to below 1", lambda x: 0.0 <= x < 1.0)
 
 
 class State(NamedTuple):

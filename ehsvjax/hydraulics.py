@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Real
 
-from ehsvjax.checks import is_numeric, refused
+from ehsvjax.checks import refused
+from ehsvjax.structures import is_numeric
 
 JET_ANGLE = math.radians(69.0)
 """Angle of the vena contracta to the spool axis, rad (paper, section 2.2)."""

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from ehsvjax.checks import function, name_of, same_structure
+from ehsvjax.checks import function
+from ehsvjax.structures import name_of, same_structure
 
 # Alexander's two-stage, second-order, L-stable, stiffly accurate SDIRK method (SIAM J. Numer. Anal. 14, 1977):
 # stages at GAMMA and 1, both implicit with the same GAMMA.

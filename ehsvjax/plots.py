@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.fit import Fit, checked_record
+from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.precision.standard_errors import quantile_of
-from ehsvjax.record import Record
+from ehsvjax.record import Record, checked_record
 from ehsvjax.summary import NOT_FINITE, percent_of_fit
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 
 
 
 def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
-    """Draw each output of a record, measured and simulated, its residual, and the search's cost by generation.
+    """Draw each output of a record, measured and simulated, its residual, and the cost by generation of a search.
 
     The residual lies in two bands: the wide one holds 95% of new samples, in the narrow one lies the true output less
     the model's with 95%, as far as the errors of the parameters go.
@@ -65,9 +65,11 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     bands = fit.bands(record, initial)
     count = len(record.outputs)
     with _style():
-        figure = _figure(width=9.0, height=3.4 * count + 2.2)
+        searched = len(fit.history.best_cost) > 0  # a fit that a diagnosis extended was not
+        figure = _figure(width=9.0, height=3.4 * count + 2.2 * searched)
         figure.suptitle(_plain(f"{fit.model.name}: {record.name}"), x=0.01, ha="left", fontweight="bold")
-        *signals, search = figure.subplots(2 * count + 1, 1, height_ratios=[2.2, 1.2] * count + [2.2])
+        rows = figure.subplots(2 * count + searched, 1, height_ratios=[2.2, 1.2] * count + [2.2] * searched)
+        signals = rows[: 2 * count]
         for i, (name, measured) in enumerate(record.outputs.items()):
             unit = fit.model.unit(name)
             axes, below = signals[2 * i : 2 * i + 2]
@@ -77,7 +79,8 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
             _draw_series(axes, record.time, {"measured": measured, "model": simulated[name]}, name, unit)
             _draw_residual(below, record.time, measured - simulated[name], unit, bands.get(name))
         _share_time(signals, record)
-        _draw_search(search, fit)
+        if searched:
+            _draw_search(rows[-1], fit)
         figure.align_ylabels()
     return figure
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.columns import Column, is_real, pick, shown, unknown_name, vector
+from ehsvjax.checks import as_number, flag, instance, refused, shown
+from ehsvjax.columns import Column, pick, unknown_name, vector
 from ehsvjax.matlab import mat_table
 from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
 from ehsvjax.record_checks import TOLERANCE, check_names, check_samples, check_settings, check_time, check_uniform
@@ -101,8 +102,8 @@ class Record:
         """
         if at is not None and fraction is None:
             middle = self._sample_from(at)
-        elif at is None and is_real(fraction) and 0 < fraction < 1:
-            middle = round(fraction * len(self))
+        elif at is None and 0.0 < (share := as_number(fraction) or 0.0) < 1.0:
+            middle = round(share * len(self))
         else:
             raise ValueError(
                 "expected either a time (s) or a fraction between 0 and 1 to split at, "
@@ -126,7 +127,7 @@ class Record:
         Raises ValueError for a gap in the inputs, and unless the period (s) is positive, at most the record's duration
         and not so short that there were more than 10^8 samples.
         """
-        if not is_real(sample_period) or not 0 < sample_period <= self.duration:
+        if not 0.0 < (as_number(sample_period) or 0.0) <= self.duration:
             raise ValueError(
                 f"cannot resample {self.name!r} to a period of {shown(sample_period)} s: "
                 f"expected a positive period of at most its duration of {self.duration:.6g} s"
@@ -136,8 +137,7 @@ class Record:
                 f"cannot resample {self.name!r} to a period of {sample_period} s: its {self.duration:.6g} s would be "
                 "more than 1e8 samples, is the period in s?"
             )
-        if not isinstance(inputs_known_in_gaps, bool):
-            raise TypeError(f"expected inputs_known_in_gaps=True or False, got {shown(inputs_known_in_gaps)}")
+        flag("inputs_known_in_gaps", inputs_known_in_gaps)
         gaps = _gaps(self.time)
         if self.inputs and gaps.any() and not inputs_known_in_gaps:
             raise ValueError(_unknown_inputs(self.name, self.time, gaps))
@@ -317,7 +317,7 @@ class Record:
         return f"{self.time[0]:.6g} to {self.time[-1]:.6g} s"
 
     def _sample_from(self, bound: float) -> int:
-        if not is_real(bound):
+        if as_number(bound) is None:
             raise TypeError(f"expected a time in s to cut {self.name!r} at ({self._span()}), got {shown(bound)}")
         return int(np.searchsorted(self.time, bound - TOLERANCE * np.diff(self.time).min()))
 
@@ -367,3 +367,29 @@ def _interpolate(values: np.ndarray, place: np.ndarray) -> np.ndarray:
 def _range(values: np.ndarray) -> str:
     missing = int(np.isnan(values).sum())
     return f"{np.nanmin(values):.6g} .. {np.nanmax(values):.6g}" + (f", {missing} missing" if missing else "")
+
+
+def checked_record(record: Any) -> Record:
+    """Return a record.
+
+    Raises:
+        ValueError: for anything else.
+
+    """
+    return instance("record", record, Record, _MAKE_ONE)
+
+
+def checked_records(records: Any) -> tuple[Record, ...]:
+    """Return one record, or a sequence of them, as a tuple.
+
+    Raises:
+        ValueError: for none, or anything else.
+
+    """
+    listed = (records,) if isinstance(records, Record) else tuple(records) if isinstance(records, Sequence) else ()
+    if not listed or not all(isinstance(record, Record) for record in listed):
+        raise refused("records", "a Record or a sequence of Records", records, _MAKE_ONE)
+    return listed
+
+
+_MAKE_ONE = "make one with Record or Record.from_csv"

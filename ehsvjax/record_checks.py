@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.columns import shown
+from ehsvjax.checks import choice, flag, instance, shown
 
 # Share of a period by which a time stamp may be off the uniform grid through the first and the last one.
 # Stamps within 1 % of any straight line always keep to it, as the grid is then itself off by at most 1 %.
@@ -16,13 +16,10 @@ _LATEST = 1e12
 
 
 def check_settings(hold: Any, name: Any, uniform: Any) -> None:
-    """Raise ValueError for another hold, TypeError for a name or a `uniform` of another type."""
-    if not isinstance(hold, str) or hold not in ("zero", "linear"):
-        raise ValueError(f"expected hold='zero' or hold='linear', got {shown(hold)}")
-    if not isinstance(name, str):
-        raise TypeError(f"expected a record's name as a string, got {shown(name)}")
-    if not isinstance(uniform, bool | np.bool_):
-        raise TypeError(f"expected uniform=True or uniform=False, got {shown(uniform)}")
+    """Raise ValueError for another hold, a name that is no text, or a `uniform` that is neither True nor False."""
+    choice("hold", hold, ("zero", "linear"))
+    instance("name", name, str, "write it between quotes")
+    flag("uniform", uniform)
 
 
 def check_names(inputs: Any, outputs: Any) -> None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ehsvjax.files import reading, written_whole
+from ehsvjax.files import reading, unreadable, written_whole
 
 VERSION = 2
 """Of the layout; version 1 had no digest."""
@@ -70,24 +70,19 @@ def read_sealed(path: str | os.PathLike, kind: str, what: str, remedy: str) -> S
     with reading(path, what, remedy):
         everything = read_arrays(path)
     if not {_CONTENT, _SEAL} <= set(everything):
-        raise ValueError(
-            f"expected {what} at {path}, got a file of an older version of ehsvjax, or another one (it holds "
-            f"{', '.join(everything) or 'nothing'}): {remedy}"
-        )
+        held = ", ".join(everything) or "nothing"
+        raise unreadable(path, what, f"it is of an older version of ehsvjax, or another file: it holds {held}", remedy)
     with reading(path, what, remedy):
-        text = everything[_CONTENT].tobytes().decode()
-        header = json.loads(text)
+        header = json.loads(everything[_CONTENT].tobytes().decode())
         found, version, facts = header["kind"], header["version"], header["facts"]
         seal = str(everything.pop(_SEAL))
     if version != VERSION:
-        raise ValueError(
-            f"expected {what} at {path}, got one of layout {version}, while this version of ehsvjax reads up to "
-            f"{VERSION}: read it with the version that wrote it"
-        )
+        reason = f"it is of layout {version}, while this version of ehsvjax reads up to {VERSION}"
+        raise unreadable(path, what, reason, "read it with the version that wrote it")
     if seal != _digest(everything):
-        raise ValueError(f"expected {what} at {path}, got one whose content was altered after it was written: {remedy}")
+        raise unreadable(path, what, "its content was altered after it was written", remedy)
     if found != kind:
-        raise ValueError(f"expected {what} at {path}, got a file that holds a {found}: {remedy}")
+        raise unreadable(path, what, f"it holds a {found}", remedy)
     arrays = {name.removeprefix(_array("")): a for name, a in everything.items() if name != _CONTENT}
     return Sealed(facts, arrays)
 

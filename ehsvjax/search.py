@@ -16,8 +16,9 @@ from jaxtyping import Array, Key
 
 from ehsvjax import genetic
 from ehsvjax import islands as archipelago
+from ehsvjax.checks import fits_memory, whole
 from ehsvjax.fingerprint import fingerprint
-from ehsvjax.genetic import History, Operators, State
+from ehsvjax.genetic import History, Operators, State, check_operators
 from ehsvjax.sealed import read_sealed, write_sealed
 
 # Of one compiled call, s: an interrupt is heard between two.
@@ -162,40 +163,21 @@ def check_sizes(population: int, generations: int, operators: Operators, islands
     """Refuse sizes of a search that cannot be; arguments as for `search`.
 
     Raises:
-        ValueError: if one is no whole number or too small, if elite or immigrants fill the population, or if the
-            machine's memory could not hold what would be in it at once.
+        ValueError: if one is no whole number or too small, for operators that are none, and if the machine's memory
+            could not hold what would be in it at once.
 
     """
-    sizes = (("population", population, 4), ("generations", generations, 1), ("islands", islands, 1))
-    for name, value, least in sizes:
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"expected {name} to be a whole number of at least {least}, got {value!r}")
-    if not 1 <= operators.elites < population:
-        raise ValueError(f"expected 1 to {population - 1} elites (fewer than the population), got {operators.elites}")
-    if not 0 <= operators.immigrants < 1:
-        raise ValueError(f"expected immigrants to be a share of the population from 0 to 1, got {operators.immigrants}")
-    number = np.dtype(np.float32).itemsize
-    needed = {
-        f"population={population} on islands={islands}": number * int(population) * int(islands) * unknowns * _COPIES,
-        f"generations={generations}": number * int(generations) * (len(History._fields) - 1 + unknowns),
-    }
-    memory = _memory()
-    for what, size in needed.items():
-        if size > memory:
-            raise ValueError(
-                f"expected a search that fits into this machine's memory of {memory / 1e9:.3g} GB, got {what}, which "
-                f"takes {size / 1e9:.3g} GB for {unknowns} unknowns: take fewer"
-            )
+    whole("population", population, 4)
+    whole("generations", generations, 1)
+    whole("islands", islands, 1)
+    check_operators(operators, population)
+    number, together = np.dtype(np.float32).itemsize, int(population) * int(islands)
+    sizes = f"population={population} on islands={islands} for {unknowns} unknowns"
+    fits_memory("a search", sizes, number * together * unknowns * _COPIES)
+    remembered = number * int(generations) * (len(History._fields) - 1 + unknowns)
+    fits_memory("a search", f"generations={generations} for {unknowns} unknowns", remembered)
     if generations > np.iinfo(np.int32).max:
         raise ValueError(f"expected at most {np.iinfo(np.int32).max} generations, got {generations}")
-
-
-def _memory() -> float:
-    """Return the memory of this machine in bytes; +inf where the system does not say."""
-    try:
-        return float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    except (AttributeError, OSError, ValueError):
-        return float("inf")
 
 
 def _bar(generations: int, done: int):

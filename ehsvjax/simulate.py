@@ -4,7 +4,6 @@ import functools
 import math
 import warnings
 from collections.abc import Callable, Mapping
-from numbers import Integral
 from typing import Any, NamedTuple
 
 import jax
@@ -13,11 +12,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ehsvjax.checks import by_name, function, instance, number
+from ehsvjax.checks import by_name, function, instance, number, whole
 from ehsvjax.integrators import repeated, scan_samples
 from ehsvjax.models.check import check_equations, where_not_finite
 from ehsvjax.models.model import Equations, Model, identity
-from ehsvjax.record import Record
+from ehsvjax.record import Record, checked_record
 
 # Of one simulation: what takes minutes.
 _MOST_STEPS = 10**9
@@ -65,7 +64,7 @@ def simulate(
 
     """
     instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
-    instance("record", record, Record, "make one with Record or Record.from_csv")
+    checked_record(record)
     function("signal", signal, "signal(name, value, **context) -> value")
     values = changed(model, "parameters", model.nominal, parameters)
     start = changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
@@ -118,8 +117,7 @@ def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
     if substeps is None:
         # A period that equals max_step but for rounding is one step.
         substeps = max(1, math.ceil(record.sample_period / model.max_step * (1.0 - 1e-3)))
-    if isinstance(substeps, bool) or not isinstance(substeps, Integral) or substeps < 1:
-        raise ValueError(f"expected substeps to be a whole number of at least 1, got {substeps!r}")
+    whole("substeps", substeps, 1)
     if substeps * len(record) > _MOST_STEPS:
         raise ValueError(
             f"expected at most {_MOST_STEPS:g} integration steps, got {len(record)} samples of {substeps:.3g} each: "

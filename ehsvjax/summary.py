@@ -56,6 +56,8 @@ _LARGE = 0.1
 # Per cent beyond which a figure says no more than that.
 _ABSURD = 1000.0
 NOT_FINITE = "not finite"
+# Noise variances below which what the integration is worth need not be told.
+_LEAST_WORTH = 0.001
 # Correlations that are printed, as in lmfit's reports.
 _LEAST_CORRELATION = 0.5
 _RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
@@ -111,16 +113,17 @@ def _record_row(record: Record) -> tuple[str, ...]:
 def _statistics_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     effort = fit.effort
     samples = sum(int(np.isfinite(y).sum()) for record in fit.records for y in record.outputs.values())
-    rows = [
-        ("method", f"genetic algorithm, {_search(effort)}"),
-        ("refinement", _refinement(effort)),
+    rows = _method_rows(effort)
+    if fit.huber is not None:
+        rows.append(("residuals", f"weighed linearly beyond {fit.huber:g} standard deviations (Huber)"))
+    if effort.step_size is not None:
+        rows.append(("integration", _integration(effort.step_size, effort)))
+    return [
+        *rows,
         ("samples", f"{samples} measured"),
         ("unknowns", _unknowns(fit)),
         ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}" if math.isfinite(fit.cost) else NOT_FINITE),
     ]
-    if fit.huber is not None:
-        rows.insert(2, ("residuals", f"weighed linearly beyond {fit.huber:g} standard deviations (Huber)"))
-    return rows
 
 
 def _unknowns(fit: Fit) -> str:
@@ -130,6 +133,37 @@ def _unknowns(fit: Fit) -> str:
         words += f", {initial} initial condition{'s' if initial > 1 else ''}"
         words += f" of each of {records} records" if records > 1 else ""
     return words
+
+
+def _method_rows(effort: Effort) -> list[tuple[str, str]]:
+    if not effort.generations:
+        ended = "converged" if effort.converged else "not converged"
+        return [("method", f"refitted by a diagnosis, from the fit that it extends: by gradient, {ended}")]
+    return [("method", f"genetic algorithm, {_search(effort)}"), ("refinement", _refinement(effort))]
+
+
+def _integration(step_size: float, effort: Effort) -> str:
+    words = [f"steps of {_seconds(step_size)}"]
+    if effort.arithmetic is not None:
+        words.append(f"worth {_worth(effort.arithmetic)}")
+    if effort.left_out:
+        readings = "1 reading" if effort.left_out == 1 else f"{effort.left_out} readings"
+        words.append(f"{readings} beside jumps left out")
+    return "; ".join(words)
+
+
+def _worth(variances: float) -> str:
+    if not math.isfinite(variances):
+        return "more than can be said, half a step is not finite"
+    size = f"{variances:.2g}" if variances >= _LEAST_WORTH else f"less than {_LEAST_WORTH:g}"
+    return f"{size} noise variances"
+
+
+def _seconds(value: float) -> str:
+    """Return a time of integration steps in the unit that leaves a number of at least a tenth."""
+    units = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
+    factor, unit = next((pair for pair in units if value >= 0.1 * pair[0]), units[-1])
+    return f"{value / factor:.3g} {unit}"
 
 
 def _search(effort: Effort) -> str:

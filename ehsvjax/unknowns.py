@@ -1,16 +1,17 @@
 """From a model and records to a `Problem`: what is searched, between which bounds, and how noisy each output is."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.arguments import by_name, number, positive
+from ehsvjax.checks import by_name, number, positive, refused
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import Coordinates, Problem, coordinates_of, observed_outputs, stack_records
 from ehsvjax.record import Record
 
+_HUBER = "a positive number of standard deviations or None"
 Initial = str | Mapping[str, float] | Sequence[Mapping[str, float]]
 
 # First readings that tell where an initial condition lies; how far beyond them it may lie, in ranges of the output and
@@ -65,7 +66,7 @@ def problem_of(
         observed=observed,
         free=model.free,
         free_initial=free_initial,
-        huber=_checked_huber(huber),
+        huber=None if huber is None else number("huber", huber, _HUBER, lambda x: x > 0.0, "1.345 is usual"),
     )
 
 
@@ -99,21 +100,28 @@ def _given_initial(model: Model, records: Sequence[Record], initial: Initial) ->
     held = {p.name: p.value for p in model.initial if p.fixed}
     if isinstance(initial, str):
         if initial not in ("estimate", "nominal"):
-            raise ValueError(f"expected initial 'estimate', 'nominal' or known values by name, got {initial!r}")
+            raise _no_initial(initial)
         return [held | {p.name: p.value for p in model.initial if initial == "nominal"}] * len(records)
     per_record = [initial] * len(records) if isinstance(initial, Mapping) else initial
     if not isinstance(per_record, Sequence):
-        raise ValueError(f"expected initial 'estimate', 'nominal' or known values by name, got {initial!r}")
+        raise _no_initial(initial)
     if len(per_record) != len(records):
         raise ValueError(f"expected initial conditions for each of {len(records)} records, got {len(per_record)}")
-    known = [by_name("initial conditions", given) for given in per_record]
+    known = [by_name("initial conditions", given, "{'initial_position': 0.0}") for given in per_record]
     if any(set(given) != set(known[0]) for given in known):
         raise ValueError("expected the same initial conditions to be known in every record, got different names")
     for name in known[0]:
         if name not in names:
             there = ", ".join(names) or "none"
             raise ValueError(f"expected an initial condition of {model.name}, got {name!r}; it has {there}")
-    return [held | {name: number(name, value) for name, value in given.items()} for given in known]
+    return [
+        held | {name: number(name, value, remedy="give its value, SI") for name, value in given.items()}
+        for given in known
+    ]
+
+
+def _no_initial(initial: Any) -> ValueError:
+    return refused("initial", "'estimate', 'nominal' or known values by name", initial, "choose one")
 
 
 class _Shown(NamedTuple):
@@ -167,19 +175,23 @@ def _variances(model, records, observed, given) -> Float[np.ndarray, " signal"]:
                 for name in observed
             ]
         )
-    given = by_name("noise_variance", given)
+    given = by_name("noise_variance", given, "{'position': 1e-8}")
     if set(given) != set(observed):
         raise ValueError(
             f"expected the noise variance of each measured output of {model.name}, {', '.join(observed)}; "
             f"got {', '.join(given) or 'none'}"
         )
-    words = {name: f"a positive noise variance of {name}, in ({model.unit(name)})^2" for name in observed}
-    return np.array([positive(words[name], given[name]) for name in observed])
+    return np.array([checked_variance(model, name, given[name]) for name in observed])
 
 
-def _checked_huber(huber):
-    words = "huber to be a positive number of standard deviations (1.345 is usual) or None"
-    return None if huber is None else positive(words, huber)
+def checked_variance(model: Model, output: str, variance: Any) -> float:
+    """Return the variance of an output's noise.
+
+    Raises:
+        ValueError: for what is no positive number.
+
+    """
+    return positive(f"noise_variance of {output}", variance, f"give it in ({model.unit(output)})^2")
 
 
 def _check_enough_samples(model, records, measured, unknowns):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from benchmarks import damaged_arguments, damaged_models
+from benchmarks import damaged_arguments, damaged_models, damaged_results
 from benchmarks.damaged_calls import answer_of, offenders
 from benchmarks.damaged_models import FAULTS, tank, tank_record, with_derivative
 from ehsvjax import Parameter, Signal, effects, excitation
@@ -35,6 +35,12 @@ def test_wrong_arguments_are_refused_by_a_sentence_and_at_once(room):
     # The right calls all, of the wrong ones every sixth.
     chosen = [call for i, call in enumerate(calls) if call.may_answer or i % 6 == 0]
     assert offenders([answer_of(call) for call in chosen]) == []
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_wrong_arguments_of_records_and_fits_are_refused_by_a_sentence_and_at_once():
+    calls = [call for call in damaged_results.calls() if not call.may_answer and call.name != "diagnose"]
+    assert offenders([answer_of(call) for call in calls[::7]]) == []
 
 
 @pytest.mark.usefixtures("unchecked")

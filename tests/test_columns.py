@@ -254,7 +254,7 @@ CSV_REFUSED = [
     ("t,u,y,u\n0,1,2,3\n1,1,1,1\n", "column 'u' stands more than once in {}", "rename one"),
     ("t;u;y\n0;1;2\n", "unknown column 'u' in {}", "known: 't;u;y'"),
     ("t,u,y\n0,1,2,3\n1,1,3,3\n", "the rows of {} have more fields than its header", "header=0, names="),
-    ("", "{} is an empty file", "check that the export"),
+    ("", "{} cannot be read as a text file with columns (it is empty)", "check that its export"),
     ("\n\n", "{} holds no columns", "check skiprows"),
     ("t,u,y\n0,1,2\n1,1,3\n3,1,4\n4,1,4\n", "time is not uniform", "sample 2 comes 2 s after sample 1"),
 ]
@@ -294,7 +294,8 @@ def test_missing_and_empty_files(read, tmp_path):
     with pytest.raises(FileNotFoundError):
         read(tmp_path / "nowhere", **PLAIN)
     (tmp_path / "empty").touch()
-    assert f"{tmp_path / 'empty'} is an empty file" in refusal(read, tmp_path / "empty", **PLAIN)
+    sentence = refusal(read, tmp_path / "empty", **PLAIN)
+    assert f"{tmp_path / 'empty'} cannot be read as" in sentence and "(it is empty)" in sentence
 
 
 # NPZ

@@ -118,3 +118,21 @@ def test_what_acts_somewhere_in_its_range_is_not_called_without_effect():
     middle = np.full(problem.unknowns, 0.5)
     every = np.ones(problem.unknowns, bool)
     assert doubts._about_unknowns(model, problem, middle, every) == ()
+
+
+def test_an_integration_that_no_step_settles_is_said():
+    """A relay that chatters about its switching point is as far off as its steps are long, however short they are."""
+
+    def derivative(parameters, state, inputs, signal):
+        return {"x": parameters["gain"] * inputs["command"] - 1e3 * jax.numpy.sign(state["x"])}
+
+    relay = replace(GROWTH, name="relay", stepper=ehsvjax.runge_kutta_4(derivative)).with_bounds(fixed={"rate": -1.0})
+    fit = _identified(_record(0.01 * NOISE), relay, refine=False, initial="nominal", noise_variance={"level": 1e-6})
+    assert fit.effort.arithmetic > 1.0
+    (said,) = [w for w in fit.warnings if w.startswith("the integration of relay is off by ")]
+    assert "use a smaller max_step" in said and "stiff" in said
+    assert f"worth {fit.effort.arithmetic:.2g} noise variances" in str(fit)
+    sound = fit.effort._replace(arithmetic=0.01)
+    assert (
+        doubts.about_arithmetic(relay, sound) == doubts.about_arithmetic(relay, sound._replace(arithmetic=None)) == ()
+    )

@@ -141,17 +141,17 @@ _HOSTILE = r"a_b $x^{ <b>&\frac{1}{ \n$$$"
 
 
 def _with_hostile_names():
-    """Return a fit whose every name and unit a formula, a tag or a new line could be read into."""
+    """Return a fit whose every name and unit a formula or a tag could be read into, and its record's a new line."""
     model = hand_made.amplifier()
-    record = hand_made.record(_HOSTILE)
+    record = hand_made.record(f"{_HOSTILE}\n{_HOSTILE}")
 
     def renamed(part):
-        return part._replace(name=f"{part.name} {_HOSTILE}", unit=f"{part.unit}$_{{<\n")
+        return part._replace(name=f"{part.name} {_HOSTILE}", unit=f"{part.unit}$_{{<")
 
     def measure(parameters, state, inputs, signal):
         plain = {name.split()[0]: value for name, value in parameters.items()}
         given = {name.split()[0]: value for name, value in inputs.items()}
-        outputs = model.measure(plain, state, given, signal)
+        outputs = model.measure(plain, state, given, lambda name, value: signal(f"{name} {_HOSTILE}", value))
         return {f"{name} {_HOSTILE}": value for name, value in outputs.items()}
 
     def start(parameters, initial, inputs):
@@ -192,7 +192,7 @@ def test_any_name_is_drawn_letter_by_letter():
     for name, figure in figures.items():
         assert to_png(figure, 30.0).startswith(b"\x89PNG"), name
     drawn = figures["fit"].get_suptitle()
-    assert "\n" not in drawn and drawn.count("$") == drawn.count(r"\$") == 2 * _HOSTILE.count("$")
+    assert "\n" not in drawn and drawn.count("$") == drawn.count(r"\$") == 3 * _HOSTILE.count("$")
 
 
 def test_any_name_is_printed_on_its_line():
@@ -206,3 +206,14 @@ def test_any_name_is_printed_on_its_line():
 def test_a_history_that_failed_at_first_is_drawn():
     history = hand_made.fit().history._replace(best_cost=np.array([np.inf, 9.0, 3.1]))
     assert to_png(hand_made.fit(history=history).plot(), 30.0).startswith(b"\x89PNG")
+
+
+def test_a_fit_that_was_not_searched_for_has_no_empty_panel():
+    none = np.zeros(0)
+    searched = hand_made.fit()
+    fit = hand_made.fit(
+        history=searched.history._replace(**dict.fromkeys(searched.history._fields[:-1], none), best={})
+    )
+    titles = [[axes.get_title(loc="left") for axes in one.plot().axes] for one in (searched, fit)]
+    assert titles[0] == [*titles[1], "genetic search"]
+    assert to_png(fit.plot(), 30.0).startswith(b"\x89PNG")

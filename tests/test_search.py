@@ -17,7 +17,7 @@ import pytest
 from jax.tree_util import Partial
 
 import ehsvjax
-from ehsvjax import search
+from ehsvjax import checks, search
 from ehsvjax.genetic import Operators
 
 ROOT = Path(__file__).parents[1]
@@ -60,11 +60,11 @@ def test_a_checkpoint_that_was_altered_or_is_of_an_older_version_is_refused(tmp_
         everything = dict(file.items())
     with open(path, "wb") as file:
         np.savez(file, **everything | {"array/state/cost": np.zeros(8, np.float32)})
-    with pytest.raises(ValueError, match="expected a checkpoint of a search at .* altered after .*: remove it or name"):
+    with pytest.raises(ValueError, match="run cannot be read as a checkpoint of a search .* altered .*: remove it"):
         _searched(checkpoint=path)
     with open(path, "wb") as file:
         np.savez(file, fingerprint=np.array("1b2c"), leaf_0=np.zeros(2, np.uint32))
-    with pytest.raises(ValueError, match="got a file of an older version of ehsvjax, or another one .*: remove it or"):
+    with pytest.raises(ValueError, match="of an older version of ehsvjax, or another file: .*: remove it or name"):
         _searched(checkpoint=path)
 
 
@@ -114,11 +114,11 @@ def test_history_is_as_long_as_what_was_run():
 @pytest.mark.parametrize(
     ("sizes", "said"),
     [
-        ({"population": 10**12}, r"got population=1000000000000 on islands=1, which takes 4e\+04 GB"),
-        ({"islands": 10**11}, "got population=8 on islands=100000000000, which takes"),
+        ({"population": 10**12}, r"got population=1000000000000 on islands=1 for 2 unknowns, which takes 4e\+04 GB"),
+        ({"islands": 10**11}, "got population=8 on islands=100000000000 for 2 unknowns, which takes"),
         (
             {"generations": 10**13},
-            r"got generations=10000000000000, which takes 2\.4e\+05 GB for 2 unknowns: take fewer",
+            r"got generations=10000000000000 for 2 unknowns, which takes 2\.4e\+05 GB: take fewer",
         ),
     ],
 )
@@ -128,14 +128,14 @@ def test_sizes_that_no_memory_holds_are_refused(sizes, said):
 
 
 def test_more_generations_than_are_counted_are_refused(monkeypatch):
-    monkeypatch.setattr(search, "_memory", lambda: np.inf)
+    monkeypatch.setattr(checks, "_memory", lambda: np.inf)
     with pytest.raises(ValueError, match="expected at most 2147483647 generations, got 2147483648"):
         _searched(generations=2**31)
 
 
 def test_sizes_are_refused_before_anything_is_traced(monkeypatch):
     room = importlib.import_module("ehsvjax.identify")
-    monkeypatch.setattr(room, "_compile_refinement", lambda *_: pytest.fail("traced"))
+    monkeypatch.setattr(room, "compile_refinement", lambda *_: pytest.fail("traced"))
     time_stamps = np.arange(40) * 0.05
     record = ehsvjax.Record(time_stamps, {"command": np.ones(40)}, {"position": np.sin(time_stamps)})
     with pytest.raises(ValueError, match="population=1000000000000 on islands=1"):

@@ -113,6 +113,36 @@ def test_effort_is_told_as_it_was():
     assert "7 steps by gradient, not converged; 3 of 4" in unconverged
 
 
+@pytest.mark.parametrize(
+    ("effort", "words"),
+    [
+        ({"step_size": 2.5e-4, "arithmetic": 0.0096, "left_out": 53},
+         "steps of 0.25 ms; worth 0.0096 noise variances; 53 readings beside jumps left out"),
+        ({"step_size": 0.02, "arithmetic": 3e-9}, "steps of 20 ms; worth less than 0.001 noise variances"),
+        ({"step_size": 7.8125e-7, "arithmetic": 312.4, "left_out": 1},
+         "steps of 0.781 µs; worth 3.1e+02 noise variances; 1 reading beside jumps left out"),
+        ({"step_size": 1.0, "arithmetic": math.inf},
+         "steps of 1 s; worth more than can be said, half a step is not finite"),
+        ({"step_size": 5e-6}, "steps of 5 µs"),
+    ],
+)  # fmt: skip
+def test_the_step_of_the_integration_and_what_it_is_worth_are_said(effort, words):
+    fit = hand_made.fit()
+    text = summary(replace(fit, effort=fit.effort._replace(**effort)))
+    assert f"    integration         {words}\n" in text
+
+
+def test_a_fit_that_a_diagnosis_extended_was_not_searched_for():
+    fit = hand_made.fit()
+    effort = fit.effort._replace(population=0, generations=0, simulations=0, iterations=0, starts=1, starts_agreeing=1)
+    text = summary(replace(fit, effort=effort))
+    assert (
+        "    method              refitted by a diagnosis, from the fit that it extends: by gradient, converged\n"
+        in text
+    )
+    assert not any(words in text for words in ("genetic", "individuals", "refinement", "0 steps", "starts led"))
+
+
 def test_warnings_stand_one_below_the_other():
     text = summary(hand_made.fit(warnings=("gain is at its upper bound", "not refined")))
     assert text.endswith("[[Warnings]]\n    gain is at its upper bound\n    not refined")

@@ -115,21 +115,25 @@ MODEL = ehsvjax.van_der_pol()
 @pytest.mark.parametrize(
     ("model", "options", "sentence"),
     [
-        (MODEL, {"initial": "zero"}, "expected initial 'estimate', 'nominal' or known values by name, got 'zero'"),
+        (MODEL, {"initial": "zero"}, "to be 'estimate', 'nominal' or known values by name, got 'zero'"),
         (
             MODEL,
             {"initial": {"speed": 0.0}},
             "initial condition of Van der Pol oscillator, got 'speed'; it has initial",
         ),
-        (MODEL, {"initial": {"initial_position": np.nan}}, "expected a finite value for initial_position, got nan"),
+        (MODEL, {"initial": {"initial_position": np.nan}}, "expected initial_position to be a finite number, got nan"),
         (MODEL, {"initial": [{}, {}]}, "expected initial conditions for each of 1 records, got 2"),
         (
             MODEL,
             {"noise_variance": {}},
             "expected the noise variance of each measured output of .*, position; got none",
         ),
-        (MODEL, {"noise_variance": {"position": 0.0}}, "expected a positive noise variance of position, .* got 0.0"),
-        (MODEL, {"noise_variance": {"position": np.inf}}, "expected a positive noise variance of position"),
+        (
+            MODEL,
+            {"noise_variance": {"position": 0.0}},
+            "noise_variance of position to be positive, got 0.0: give it in",
+        ),
+        (MODEL, {"noise_variance": {"position": np.inf}}, "expected noise_variance of position to be positive"),
         (MODEL, {"huber": 0.0}, "expected huber to be a positive number of standard deviations"),
         (MODEL, {"huber": float("nan")}, "expected huber to be a positive number"),
         (

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.checks import in_words, is_numeric, name_of, same_structure
 from ehsvjax.models.model import Equations, Model
+from ehsvjax.structures import in_words, is_numeric, name_of, same_structure
 
 _SAMPLES = 8  # of a series that `prepare` is traced with
 _OWN = Path(__file__).parents[1]

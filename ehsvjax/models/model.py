@@ -31,7 +31,6 @@ from ehsvjax.checks import (
     label,
     number,
     positive,
-    refused,
     several,
     text,
 )
@@ -170,12 +169,6 @@ class Model:
         function(f"measure of {self.name}", self.measure, "measure(parameters, state, inputs, signal) -> outputs")
         if self.prepare is not None:
             function(f"prepare of {self.name}", self.prepare, "prepare(parameters, inputs, sample_period) -> inputs")
-        for equation in (self.start, self.stepper, self.measure, self.prepare):
-            try:
-                hash(equation)
-            except TypeError:
-                remedy = "compiled programs are kept by it; use functions, or frozen dataclasses"
-                raise refused(f"each equation of {self.name}", "something with a hash", equation, remedy) from None
 
     @property
     def inputs(self) -> tuple[str, ...]:

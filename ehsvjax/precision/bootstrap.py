@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
-from ehsvjax.arguments import one_of, whole_number
+from ehsvjax.checks import choice, fits_memory, whole
 from ehsvjax.draws import check_key
 from ehsvjax.population import Problem, cast, to_unit, to_values
 from ehsvjax.precision.residual_noise import ResidualNoise
@@ -94,8 +94,9 @@ def bootstrap(
 
     """
     check_key(key)
-    one_of("kind", kind, ("parametric", "block"))
-    whole_number("draws", draws, 2)
+    choice("kind", kind, ("parametric", "block"))
+    whole("draws", draws, 2)
+    fits_memory("a bootstrap", f"draws={draws} of {simulated.size} readings", float(draws) * simulated.nbytes)
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
     deviation = np.sqrt(problem.noise_variance)
     shape = simulated.shape[:2]

@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ehsvjax.checks import by_name, instance, positive, several
+from ehsvjax.checks import by_name, instance
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
 from ehsvjax.precision.sensitivities import check_finite, sensitivities
 from ehsvjax.precision.standard_errors import Precision, covariance_of, linearised, precision_of
-from ehsvjax.record import Record
+from ehsvjax.record import Record, checked_records
 from ehsvjax.simulate import changed, simulate
-from ehsvjax.unknowns import Initial, problem_of
+from ehsvjax.unknowns import Initial, checked_variance, problem_of
 
 
 def design(
@@ -93,9 +93,7 @@ def cramer_rao_bound(
 def _checked(model: Model, records, noise_variance) -> tuple[Record, ...]:
     """Return the records as a tuple, once they, the model and the variances can be meant."""
     instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
-    records = (records,) if isinstance(records, Record) else records
-    if not several("records", records, Record, "make each with Record or Record.from_csv"):
-        raise ValueError("expected records to be one at least, got none: plan an experiment with Record(time, inputs)")
+    records = checked_records(records)
     given = by_name("noise_variance", noise_variance, "{'position': 1e-8}")
     known = ", ".join(model.outputs)
     if not given:
@@ -105,8 +103,8 @@ def _checked(model: Model, records, noise_variance) -> tuple[Record, ...]:
     for name, variance in given.items():
         if name not in model.outputs:
             raise ValueError(f"expected noise_variance of outputs of {model.name}, {known}; got {name!r}")
-        positive(f"noise_variance of {name}", variance, f"give it in the unit of {name} squared")
-    return tuple(records)
+        checked_variance(model, name, variance)
+    return records
 
 
 def _point(model: Model, problem: Problem, parameters, initial_values) -> np.ndarray:

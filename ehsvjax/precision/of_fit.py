@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ehsvjax.arithmetic import settled_at
+from ehsvjax.checks import refused
 from ehsvjax.failure import warn_of_failure
-from ehsvjax.fit import Fit, checked_record
+from ehsvjax.fit import Fit
 from ehsvjax.population import Problem, to_unit
 from ehsvjax.precision.bands import Band, deviations, new_deviations
 from ehsvjax.precision.bootstrap import Bootstrap, bootstrap
@@ -58,13 +59,14 @@ def profiles(fit: Fit, of: Prepared, names: Sequence[str] | None, level: float) 
 
     """
     if isinstance(names, str) or not isinstance(names, Sequence | None):
-        raise ValueError(f"expected names of parameters as a list, [name, ...], got {names!r}")
+        raise refused("names", "names of parameters", names, "give them in a list, [name, ...]")
     names = of.problem.free if names is None else tuple(names)
+    known = ", ".join(of.problem.free)
     if not names:
-        raise ValueError(f"expected names of parameters, of {', '.join(of.problem.free)}; got none")
+        raise ValueError(f"expected names of parameters, of {known}; got none")
     for name in names:
         if name not in of.problem.free:
-            raise ValueError(f"expected parameters that were identified, {', '.join(of.problem.free)}; got {name!r}")
+            raise ValueError(f"expected parameters that were identified, {known}; got {name!r}")
     found, _, factor, curvature, _, covariance, seen = of.first_order
     deviation = np.sqrt(np.diagonal(covariance_of(found, None, factor)[0]))
     # Where the noise is coloured the cost rises too fast by the ratio of the variances (Rotnitzky & Jewell 1990).
@@ -100,17 +102,16 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
         ValueError: if the record holds none of the outputs that were fitted.
 
     """
-    quantile, record = quantile_of(level), checked_record(record)
+    quantile, start = quantile_of(level), fit.initial_of(record, initial)
     found, covariance, factor = of.first_order.found, of.first_order.covariance, _sample_variance(fit, of)
     noise = np.sqrt(of.problem.noise_variance)
-    for i, fitted in enumerate(fit.records):
-        if fitted is record:
+    for i, (fitted, estimated) in enumerate(zip(fit.records, fit.initial, strict=True)):
+        if fitted is record and start == estimated:
             spread = deviations(found, covariance)[i, : len(record)]
             return _bands(of.problem.observed, spread, noise, factor, quantile)
     names = [name for name in record.outputs if name in fit.noise_variance]
     if not names:
         raise ValueError(f"expected {record.name} to hold one of {', '.join(fit.noise_variance)}, got none of them")
-    start = fit.initial_of(record, initial)
     problem = _problem(fit, [record.select(outputs=names)], [start])
     values = [fit.parameters[name] for name in problem.free] + [start[name] for name in problem.free_initial]
     new = sensitivities(problem, np.array(values))

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ehsvjax.arguments import number, one_of
+from ehsvjax.checks import choice, number
 from ehsvjax.models.model import Model
 from ehsvjax.population import Problem
 from ehsvjax.precision.directions import (
@@ -98,8 +98,7 @@ def quantile_of(level: float) -> float:
         ValueError: unless the level is between 0 and 1.
 
     """
-    if not 0.0 < number("a confidence level between 0 and 1", level) < 1.0:
-        raise ValueError(f"expected a confidence level between 0 and 1, such as 0.95, got {level!r}")
+    level = number("level", level, "a confidence level between 0 and 1", lambda x: 0.0 < x < 1.0, "0.95 is usual")
     return NormalDist().inv_cdf(0.5 + 0.5 * level)
 
 
@@ -147,7 +146,7 @@ def linearised(
         ValueError: for an unknown colour, or where the simulation or a derivative of it is not finite.
 
     """
-    one_of("noise", colour, ("auto", "white", "coloured"))
+    choice("noise", colour, ("auto", "white", "coloured"))
     found = sensitivities(problem, values)
     check_finite(problem, found)
     noises, factor, curvature, words = None, 1.0, 1.0, "white, of the variance given"

@@ -1,11 +1,13 @@
 """A fit or a diagnosis, saved and loaded."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from ehsvjax.checks import instance, several
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
+from ehsvjax.files import unreadable
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
 from ehsvjax.sealed import read_sealed, write_sealed
@@ -62,10 +64,9 @@ def _save(result: Any, path: str | os.PathLike) -> None:
 
 
 def _check_handed(model: Any, bank: Any) -> None:
-    if model is not None and not isinstance(model, Model):
-        raise ValueError(f"expected the model that was fitted, or none for one of this package, got {model!r}")
-    if not isinstance(bank, Iterable) or not all(isinstance(effect, Effect) for effect in bank):
-        raise ValueError(f"expected bank to hold effects, (*ehsvjax.effects.BANK, my_effect), got {bank!r}")
+    if model is not None:
+        instance("model", model, Model, "hand over the model that was fitted, or none for one of this package")
+    several("bank", bank, Effect, "hand over (*ehsvjax.effects.BANK, my_effect)")
 
 
 def _load(path: str | os.PathLike, kind: type, what: str, model: Model | None, bank: Sequence[Effect]) -> Any:
@@ -73,10 +74,10 @@ def _load(path: str | os.PathLike, kind: type, what: str, model: Model | None, b
     try:
         result = from_tree(Tree(sealed.facts["objects"], sealed.arrays), model, bank)
     except ValueError as error:
-        raise ValueError(f"expected {what} at {path} that this program can put together, got {error}") from error
+        raise ValueError(f"{path} cannot be read as {what}: it holds {error}") from error
     except Exception as error:
         # The seal is whole: it was not written by this package.
-        raise ValueError(f"expected {what} at {path}, got what was never a result ({error!r}): {_DAMAGED}") from error
+        raise unreadable(path, what, f"it was never a result, {error!r}", _DAMAGED) from error
     if not isinstance(result, kind):
-        raise ValueError(f"expected {what} at {path}, got one of {type(result).__name__}: {_DAMAGED}")
+        raise unreadable(path, what, f"it is one of {type(result).__name__}", _DAMAGED)
     return result

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ehsvjax.files import reading
+from ehsvjax.files import reading, unreadable
 from ehsvjax.fit import Effort, Fit, History
-from ehsvjax.models.model import Model, Parameter
+from ehsvjax.models.model import Model
 from ehsvjax.record import Record
 from ehsvjax.sealed import read_arrays
 from ehsvjax.storage.models import MAKERS
@@ -58,7 +58,7 @@ def load_fit(path: str | os.PathLike, model: Model | None = None) -> Fit:
         fit = _fit(facts, arrays, _as_fitted(model, stored))
         problem = _contradiction(fit)
     if problem:
-        raise ValueError(f"expected {_WHAT} at {path}, got one that contradicts itself, {problem}: {_REMEDY}")
+        raise unreadable(path, _WHAT, f"it contradicts itself, {problem}", _REMEDY)
     return fit
 
 
@@ -94,11 +94,11 @@ def _fit(facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray], model: Mode
 
 
 def _as_fitted(model: Model, stored: Mapping[str, Mapping[str, Any]]) -> Model:
-    """Return the model with the values, bounds and fixed parameters of the fit."""
+    """Return the model with the values, bounds and fixed parameters of the fit; what was not stored is the model's."""
     return replace(
         model,
-        parameters=tuple(Parameter(**stored[p.name]) for p in model.parameters),
-        initial=tuple(Parameter(**stored[p.name]) for p in model.initial),
+        parameters=tuple(p._replace(**stored[p.name]) for p in model.parameters),
+        initial=tuple(p._replace(**stored[p.name]) for p in model.initial),
     )
 
 
