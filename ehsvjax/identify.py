@@ -122,7 +122,6 @@ def identify(
     )
     effort = _search_effort(found, generations)
     reweigh = noise_variance is None
-    problem = settled_at(problem, _within_bounds(begin, problem, np.asarray(found.elites, np.float64)[0]))
     if compiling is None:
         best = _as_searched(begin, problem, found, effort, reweigh=reweigh)
     else:
@@ -287,6 +286,8 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
     With one output and squared residuals its weight does not move the minimum. The number returned says how many starts
     came to within a tenth of a noise variance of the same minimum, in the first round.
     """
+    every = problem.samples
+    problem = settled_at(problem, np.asarray(starts[0]))
     with jax.enable_x64(True):
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
         nothing = jnp.zeros(np.shape(starts), bool)
@@ -299,9 +300,12 @@ def _refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Ref
             before = problem
             if reweigh:
                 problem = replace(problem, noise_variance=_residual_variance(problem, refined.residuals[best]))
-            known = settled_at(problem, np.asarray(refined.individual[best]))
-            weighed = not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)
-            if known is problem and weighed:
+            # Of all readings: what a longer step did not know, or elsewhere, may be known here.
+            known = settled_at(replace(problem, samples=every), np.asarray(refined.individual[best]))
+            same = known.substeps == problem.substeps and np.array_equal(
+                known.samples.measured, before.samples.measured
+            )
+            if same and (not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
                 break
             problem = known
             # From the best alone, as often as there were starts: the same shape is not compiled again.

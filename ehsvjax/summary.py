@@ -114,6 +114,7 @@ def _statistics_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     rows = [
         ("method", f"genetic algorithm, {_search(effort)}"),
         ("refinement", _refinement(effort)),
+        *_integration_rows(effort),
         ("samples", f"{samples} measured"),
         ("unknowns", _unknowns(fit)),
         ("cost, equation (9)", f"{fit.cost:.6g} {_cost_unit(fit)}" if math.isfinite(fit.cost) else NOT_FINITE),
@@ -142,6 +143,17 @@ def _refinement(effort: Effort) -> str:
         return "none"
     steps = f"{effort.iterations} steps by gradient, {'converged' if effort.converged else 'not converged'}"
     return f"{steps}; {effort.starts_agreeing} of {effort.starts} starts led to this minimum"
+
+
+def _integration_rows(effort: Effort) -> list[tuple[str, str]]:
+    if effort.step_size is None:
+        return []
+    words = f"steps of {1e3 * effort.step_size:.3g} ms"
+    if effort.arithmetic is not None:
+        words += f", off by {effort.arithmetic:.2g} noise variances"
+    if effort.left_out:
+        words += f"; {effort.left_out} readings, which no such step knows, carry no weight"
+    return [("integration", words)]
 
 
 def _cost_unit(fit: Fit) -> str:
