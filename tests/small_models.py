@@ -126,14 +126,17 @@ def _tanks_outputs(parameters, state, inputs, signal):
     return {"lower": signal("lower", state["lower"])}
 
 
-def tanks_plant(voltage, period, *, brim=np.inf, start=(1.0, 1.0), steps=100) -> np.ndarray:
-    """Return the levels [time, 2] of tanks, of which the upper one is full at its brim: the rest is spilled."""
+def tanks_plant(voltage, period, *, brim=np.inf, least=0.0, start=(1.0, 1.0), steps=100) -> np.ndarray:
+    """Return the levels [time, 2] of tanks, of which the upper one is full at its brim: the rest is spilled.
+
+    At its least level it is filled up at once.
+    """
     h, (upper, lower), found = period / steps, start, []
     for u in voltage:
         found.append((upper, lower))
         for _ in range(steps):
             through = BETWEEN * upper**0.5
-            upper = min(upper + h * (PUMP * u - through), brim)
+            upper = max(min(upper + h * (PUMP * u - through), brim), least)
             lower = lower + h * (through - OUTFLOW * lower**0.5)
     return np.array(found)
 

@@ -122,8 +122,9 @@ def _hard_limit(side):
         # Where a model passes the rate at a moment, no step follows.
         return side * jnp.minimum(side * rate, room / jnp.maximum(context["step_size"], 1e-12))
 
+    # What is stored is seldom measured: with the limit its scale may be another than the nominal model has it.
     end = EffectParameter(
-        number, "{value} s", UNLIMITED, lambda s: -s[opposite], lambda s: 1.02 * s[there],
+        number, "{value} s", UNLIMITED, lambda s: -s[opposite], lambda s: 10.0 * s[there],
         lambda s: [share * s[there] - (1.0 - share) * s[opposite] for share in (0.98, 0.9, 0.75)],
     )  # fmt: skip
     return Effect(
