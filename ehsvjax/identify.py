@@ -12,7 +12,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Key
 
 from ehsvjax import doubts, genetic
-from ehsvjax.arithmetic import arithmetic_at, settled_at
+from ehsvjax.arithmetic import arithmetic_at
 from ehsvjax.checks import flag, instance, number, refused, whole
 from ehsvjax.draws import check_key
 from ehsvjax.failure import nothing_finite
@@ -132,7 +132,6 @@ def identify(
     )
     effort = _search_effort(found, generations)
     reweigh = noise_variance is None
-    problem = settled_at(problem, within_bounds(begin, problem, np.asarray(found.elites, np.float64)[0]))
     if compiling is None:
         best = as_searched(begin, problem, found, effort, reweigh=reweigh)
     else:

@@ -109,15 +109,22 @@ def _stop(side):
 
 
 def _hard_limit(side):
-    """Return the end, on one side, of what is stored: its rate of change stops there, and is lost."""
+    """Return the end, on one side, of what is stored: its rate of change stops there, and is lost.
+
+    No step goes further than to the end: one that went past it would have the level stay too high for as long as it is
+    full, an error in proportion to the step.
+    """
     sign, there, opposite = ("positive", "level+", "level-") if side > 0 else ("negative", "level-", "level+")
     number = f"{sign}_limit"
 
     def apply(own, rate, context):
-        return jnp.where(side * context["level"] >= own[number], side * jnp.minimum(side * rate, 0.0), rate)
+        room = own[number] - side * context["level"]
+        # Where a model passes the rate at a moment, no step follows.
+        return side * jnp.minimum(side * rate, room / jnp.maximum(context["step_size"], 1e-12))
 
+    # What is stored is seldom measured: with the limit its scale may be another than the nominal model has it.
     end = EffectParameter(
-        number, "{value} s", UNLIMITED, lambda s: -s[opposite], lambda s: 1.02 * s[there],
+        number, "{value} s", UNLIMITED, lambda s: -s[opposite], lambda s: 10.0 * s[there],
         lambda s: [share * s[there] - (1.0 - share) * s[opposite] for share in (0.98, 0.9, 0.75)],
     )  # fmt: skip
     return Effect(

@@ -1,0 +1,168 @@
+"""Limits of what is stored, holds, feedthroughs and pulsations: independent plants hide them, the package finds them."""
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import ehsvjax
+from ehsvjax.diagnose import diagnose
+from ehsvjax.effects import BANK, attach, candidates
+from ehsvjax.effects.internal import contexts_of
+from tests.plants import held_levels
+from tests.small_models import OUTFLOW, PUMP, carriage, carriage_plant, record_of, tanks, tanks_plant
+
+KEY = jax.random.key(0)
+
+
+def diagnosed(model, record):
+    fit = ehsvjax.identify(model, record, key=KEY, population=40, generations=15)
+    return diagnose(fit, record, key=KEY)
+
+
+def suspected(found) -> set[str]:
+    return {*found.causes, *(name for group in found.alternatives for name in group.causes)}
+
+
+# --- A tank that overflows ---
+
+PERIOD_OF_TANKS, BRIM = 0.5, 4.0
+
+
+def voltage(seed):
+    return np.repeat(np.random.default_rng(seed).uniform(0.1, 1.9, 40), 15)
+
+
+@pytest.fixture(scope="module")
+def overflowing():
+    pumped = voltage(3)
+    levels = tanks_plant(pumped, PERIOD_OF_TANKS, brim=BRIM)
+    assert 0.03 < np.mean(levels[:, 0] >= BRIM) < 0.3
+    record = record_of(PERIOD_OF_TANKS, {"voltage": pumped}, {"lower": levels[:, 1]}, {"lower": 0.01}, 1)
+    return diagnosed(tanks(), record)
+
+
+def test_a_tank_that_overflows_has_a_hard_limit(overflowing):
+    assert "hard_limit" in suspected(overflowing), str(overflowing)
+    assert len(overflowing.causes) == 1
+    name = "hard_limit.positive_limit"
+    found, error = (of[name] for of in (overflowing.extended.parameters, overflowing.extended.standard_errors))
+    assert abs(found - BRIM) < 5.0 * error and error < 0.05 * BRIM
+    assert overflowing.extended.model.parameter(name).unit == "m"
+    pump = overflowing.extended.parameters["pump"]
+    assert pump == pytest.approx(PUMP, rel=0.05), "the pump is no longer blamed for what is spilled"
+
+
+def test_a_limit_needs_no_finer_step_than_the_model(overflowing):
+    # A level that went past its limit by a step's rise, and stayed there, would need a step of a thirtieth.
+    assert overflowing.integration.step_size == tanks().max_step
+    assert sum(overflowing.integration.left_out.values()) == 0
+
+
+@pytest.mark.parametrize(("number", "limit"), [("positive_limit", BRIM), ("negative_limit", -1.5)])
+def test_a_level_stays_within_its_limit(number, limit):
+    pumped, start = voltage(4), (2.0, 2.0)
+    ends = {"positive_limit": {"brim": limit}, "negative_limit": {"least": -limit}}[number]
+    truth, unlimited = (tanks_plant(pumped, PERIOD_OF_TANKS, start=start, **e)[:, 1] for e in (ends, {}))
+    assert np.max(np.abs(truth - unlimited)) > 0.05
+    model = attach(tanks(), {f"hard_limit.{number}": (-10.0, 10.0)}, duration=300.0, bank=BANK)
+    record = ehsvjax.Record(PERIOD_OF_TANKS * np.arange(len(pumped)), {"voltage": pumped})
+    values = {"pump": PUMP, "outflow": OUTFLOW, f"hard_limit.{number}": limit}
+    found = ehsvjax.simulate(model, record, values, {"initial_upper": start[0], "initial_lower": start[1]})
+    np.testing.assert_allclose(found["lower"], truth, atol=5e-3)
+
+
+# --- A hold that is none, a sensor that shows the input ---
+
+PERIOD, SAMPLES, NOISE = 0.02, 1200, {"position": 2e-3}
+
+
+def test_an_input_that_runs_straight_from_value_to_value_is_a_hold():
+    # A smooth input: what is left is half a sample of it.
+    push = 10.0 * np.convolve(np.random.default_rng(9).standard_normal(SAMPLES + 7), np.ones(8) / 8**0.5, "valid")
+    position = carriage_plant(push, PERIOD, straight=True)[:, 0]
+    held = record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 5)
+    found = diagnosed(carriage(), held)
+    assert "input_hold" in suspected(found), str(found)
+    if "input_hold" in found.causes:
+        assert found.extended.parameters["input_hold.share"] == pytest.approx(1.0, abs=0.1)
+    # Declared as it is, nothing is missing.
+    straight = record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 5, hold="linear")
+    assert diagnosed(carriage(), straight).verdict == "adequate"
+
+
+def test_a_sensor_that_shows_a_part_of_the_input_at_once_is_named():
+    push = held_levels(6, 20.0, SAMPLES // 20, 20)
+    position = carriage_plant(push, PERIOD)[:, 0] + 1e-3 * push
+    found = diagnosed(carriage(), record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 6))
+    assert found.verdict == "named" and found.causes == ("feedthrough_of_push",), str(found)
+    assert found.extended.parameters["feedthrough_of_push.gain"] == pytest.approx(1e-3, rel=0.05)
+
+
+def test_every_input_may_reach_every_sensor_that_is_measured():
+    found = {c.name for c in attached_candidates(carriage(), ("position", "velocity"))}
+    assert {"feedthrough_of_push@position", "feedthrough_of_push@velocity"} <= found
+    assert "feedthrough_of_push" in {c.name for c in attached_candidates(carriage(), ("velocity",))}
+
+
+def attached_candidates(model, observed):
+    from ehsvjax.effects.of_model import effects_for
+
+    return candidates(model, (*BANK, *effects_for(model)), contexts_of(model), observed)
+
+
+# --- A supply that pulsates ---
+
+
+def pulsating_valve(command, period, amplitude, frequency):
+    """Simulate the paper's valve in open loop with its spool in place of the servo: Ps(t) = Ps + a*sin(w*t).
+
+    Compressible oil, so that the load pressure is a state; the spool follows the command by its transfer function.
+    """
+    dead_zone, flow_gain, gain, damping, omega = 1e-4, 1.45e-4, 0.09, 0.72, 300.0
+    area, supply, mass, stiffness, capacitance = 25e-4, 140e5, 20.0, 1e4, 1e-13
+
+    def rates(t, y, u):
+        x, v, p, p_rate, pressure = y
+        xv = np.sign(p) * min(max(abs(p) - dead_zone, 0.0), 3e-3)
+        drop = supply + amplitude * np.sin(frequency * t) - np.sign(xv) * pressure
+        flow = flow_gain * xv * np.sign(drop) * np.sqrt(abs(drop))
+        return [
+            v,
+            (area * pressure - stiffness * x) / mass,
+            p_rate,
+            omega**2 * (u - gain * x - p) - 2.0 * damping * omega * p_rate,
+            (flow - area * v) / capacitance,
+        ]
+
+    state, positions = np.zeros(5), []
+    edges = [0, *(np.flatnonzero(np.diff(command)) + 1), len(command)]
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        times = period * np.arange(first, last + 1)
+        found = solve_ivp(rates, times[[0, -1]], state, "LSODA", times, args=(command[first],), rtol=1e-8, atol=1e-10)
+        positions.append(found.y[0, :-1])
+        state = found.y[:, -1]
+    return np.concatenate(positions)
+
+
+def test_a_supply_that_pulsates_is_what_a_plant_with_one_does():
+    command = np.repeat([3e-3, -3e-3, 2e-3], 60)
+    amplitude, frequency = 20e5, 90.0
+    plain, pulsating = (pulsating_valve(command, 1e-3, a, frequency) for a in (0.0, amplitude))
+    names = ("cosine", "sine", "frequency")
+    bounds = {f"supply_pulsation.{name}": (-1e7, 1e7) if name != "frequency" else (1.0, 1e3) for name in names}
+    model = attach(ehsvjax.servovalve(hydraulic_capacitance=1e-13), bounds, duration=0.18, bank=BANK)
+    record = ehsvjax.Record(1e-3 * np.arange(len(command)), {"command": command})
+    assert np.max(np.abs(pulsating - plain)) > 2e-4
+    values = dict(zip(bounds, (0.0, amplitude, frequency), strict=True))
+    changes = [ehsvjax.simulate(model, record, values | {"supply_pulsation.sine": a})["position"]
+               for a in (0.0, amplitude, -amplitude)]  # fmt: skip
+    np.testing.assert_allclose(changes[1] - changes[0], pulsating - plain, atol=0.03 * np.ptp(pulsating - plain))
+    assert np.max(np.abs(changes[2] - changes[0] - (pulsating - plain))) > 2e-4, "the sign counts"
+
+
+def test_a_pulsation_acts_at_the_supply_alone():
+    found = [c for c in attached_candidates(ehsvjax.servovalve(), ("position",)) if c.effect.name == "supply_pulsation"]
+    assert [c.signal for c in found] == ["supply"]
+    assert found[0].effect.harmonic
+    assert found[0].unit(found[0].effect.parameters[0], ehsvjax.servovalve()) == "Pa"

@@ -1,0 +1,54 @@
+"""A clean servovalve of which the position and the load pressure are measured: nothing is blamed on arithmetic."""
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnose import diagnose
+from tests.plants import held_levels, servovalve_plant
+
+pytestmark = pytest.mark.xdist_group("diagnoses of the servovalve")
+NOISE = {"position": 3e-4, "load_pressure": 5e4}
+SAMPLES = 2500
+KEY = jax.random.key(1)
+
+
+@pytest.fixture(scope="module")
+def diagnosis():
+    # The first half of a record in which a lag of the pressure's sensor was seen.
+    command = held_levels(1, 6e-3, 25, 200)[:SAMPLES]
+    motion = servovalve_plant(command, 1e-3)
+    rng = np.random.default_rng(1001)
+    noisy = {name: getattr(motion, name) + NOISE[name] * rng.standard_normal(5000)[:SAMPLES] for name in NOISE}
+    record = ehsvjax.Record(1e-3 * np.arange(SAMPLES), {"command": command}, noisy)
+    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=KEY, population=50, generations=20)
+    return diagnose(fit, record, key=KEY)
+
+
+def test_a_clean_record_is_adequate(diagnosis):
+    assert diagnosis.verdict == "adequate", str(diagnosis)
+    assert diagnosis.causes == () and diagnosis.missing is None and diagnosis.innocent
+
+
+def test_the_step_and_what_it_is_worth_is_measured(diagnosis):
+    step, left_out, worth = diagnosis.integration
+    assert 0.0 < step <= 0.25e-3
+    assert worth < 1.0
+    assert left_out["position"] == 0
+    assert 0 < left_out["load_pressure"] < 0.06 * SAMPLES
+
+
+def test_the_print_says_the_step_and_the_readings_that_are_left_out(diagnosis):
+    step, left_out, _ = diagnosis.integration
+    text = str(diagnosis)
+    assert f"simulated in steps of {1e3 * step:.3g} ms" in text
+    assert f"{left_out['load_pressure']} readings of load_pressure, which no such step knows, carry no weight" in text
+
+
+def test_what_is_left_out_does_not_count_for_the_gain(diagnosis):
+    for name, deviation in NOISE.items():
+        gain = diagnosis.gain.outputs[name]
+        # Of 750 readings the root mean square is known to 2.6%.
+        assert gain.rmse_after == pytest.approx(deviation, rel=0.12), name
+        assert gain.noise_floor == pytest.approx(deviation, rel=0.12), name

@@ -1,0 +1,86 @@
+"""A constant that was given wrong is found under its own name, in one group with what looks the same."""
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnose import diagnose
+from tests.plants import held_levels, servovalve_plant
+from tests.small_models import MASS, STIFFNESS, carriage, carriage_plant, modulated_plant, record_of
+
+KEY = jax.random.key(0)
+PERIOD, SAMPLES = 0.02, 1200
+NOISE = {"position": 2e-3}
+PUSH = held_levels(5, 20.0, 60, 20)
+
+
+def diagnosed(model, position, seed):
+    record = record_of(PERIOD, {"push": PUSH}, {"position": position}, NOISE, seed)
+    fit = ehsvjax.identify(model, record, key=KEY, population=40, generations=15)
+    return diagnose(fit, record, key=KEY)
+
+
+def suspected(found) -> set[str]:
+    return {*found.causes, *(name for group in found.alternatives for name in group.causes)}
+
+
+@pytest.fixture(scope="module")
+def softer():
+    return diagnosed(carriage(), carriage_plant(PUSH, PERIOD, stiffness=1.5 * STIFFNESS)[:, 0], seed=1)
+
+
+def test_a_constant_that_is_off_is_in_one_group_with_what_looks_the_same(softer):
+    assert suspected(softer) == {"stiffness", "linear_stiffness"}, str(softer)
+    # The same as more of a spring at the force: no record tells them apart.
+    assert softer.verdict == "ambiguous"
+    settled_by = next(group.settled_by for group in softer.alternatives)
+    assert "stiffness: measure it, or free it: bounds={'stiffness': ...}" in settled_by
+    found = softer.extended.parameters
+    error = (
+        found["stiffness.error"] if "stiffness.error" in found else found["linear_stiffness.coefficient"] / STIFFNESS
+    )
+    assert error == pytest.approx(0.5, abs=0.01)
+
+
+def test_what_is_certain_is_no_candidate(softer):
+    assert {"stiffness", "modulation"} <= set(softer.table["cause"])
+    assert "mass" not in set(softer.table["cause"])
+    # Nor is anything that is not identified but for the record's sake.
+    assert not any(cause.startswith("record_duration") for cause in softer.table["cause"])
+
+
+def test_a_constant_that_is_certain_is_not_blamed_though_it_is_off():
+    found = diagnosed(carriage(mass=1.3 * MASS), carriage_plant(PUSH, PERIOD)[:, 0], seed=2)
+    assert found.verdict != "adequate"
+    assert "mass" not in suspected(found), str(found)
+
+
+def test_a_constant_of_zero_that_is_there_is_named_with_its_size():
+    found = diagnosed(carriage(), modulated_plant(PUSH, PERIOD, 0.5), seed=3)
+    assert found.verdict == "named" and found.causes == ("modulation",), str(found)
+    assert found.extended.parameters["modulation.value"] == pytest.approx(0.5, abs=0.01)
+    assert found.extended.model.parameter("modulation.value").unit == "1/m"
+
+
+def test_constants_that_are_right_are_excluded_above_a_size():
+    found = diagnosed(carriage(), carriage_plant(PUSH, PERIOD)[:, 0], seed=4)
+    assert found.verdict == "adequate", str(found)
+    excluded = {e.cause: e.above for e in found.excluded}
+    assert excluded["stiffness"] < 0.01 and excluded["modulation"] < 0.1
+
+
+@pytest.mark.xdist_group("diagnoses of the servovalve")
+def test_a_stiffness_given_at_half_of_what_it_is_is_found_from_the_position_alone():
+    command = held_levels(1, 6e-3, 10, 200)
+    position = servovalve_plant(command, 1e-3, stiffness=2e4).position
+    position = position + 1e-4 * np.random.default_rng(1001).standard_normal(len(command))
+    record = ehsvjax.Record(1e-3 * np.arange(len(command)), {"command": command}, {"position": position})
+    fit = ehsvjax.identify(
+        ehsvjax.servovalve(), record, key=KEY, population=50, generations=20, bounds={"flow_gain": (3e-5, 5e-4)}
+    )
+    found = diagnose(fit, record, key=KEY)
+    # The position shows the load's pressure over the supply's alone: twice the stiffness is half of area or supply.
+    assert "stiffness" in suspected(found), str(found)
+    assert found.causes[0] in ("stiffness", "piston_area", "supply_pressure"), str(found)
+    assert len(found.causes) == 1 and found.innocent
