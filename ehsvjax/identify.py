@@ -131,6 +131,9 @@ def identify(
         checkpoint=checkpoint,
     )
     effort = _search_effort(found, generations)
+    if not np.isfinite(np.asarray(found.elite_cost)[0]):
+        # A finer step may mend what failed, but where to begin would be anywhere.
+        raise _nothing_finite(begin, model, records, effort)
     reweigh = noise_variance is None
     if compiling is None:
         best = as_searched(begin, problem, found, effort, reweigh=reweigh)
@@ -139,7 +142,7 @@ def identify(
         starting = within_bounds(begin, problem, candidates(begin, model, found, starts))
         best = best_of(*refine_and_reweigh(problem, starting, reweigh=reweigh), effort, reweighed=reweigh)
     if not np.isfinite(best.cost):
-        raise ValueError(nothing_finite(model, records, nominal_initial(begin, model), effort.simulations))
+        raise _nothing_finite(begin, model, records, effort)
     fit = _fit(model, records, best, history, not reweigh)
     about = doubts.about_fit(fit, best.problem, best.individual, best.residual_variance, best.idle)
     return replace(fit, warnings=(*slow, *about))
@@ -218,6 +221,10 @@ def _search_effort(found: genetic.State, generations: int) -> Effort:
         converged=bool(found.converged),
         remaining=float("nan"),
     )
+
+
+def _nothing_finite(begin: Problem, model: Model, records: Sequence[Record], effort: Effort) -> ValueError:
+    return ValueError(nothing_finite(model, records, nominal_initial(begin, model), effort.simulations))
 
 
 def _fit(model, records, best: Best, history: genetic.History, noise_variance_given: bool) -> Fit:

@@ -96,7 +96,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     problem = settled_at(problem, np.asarray(starts[0]))
     with jax.enable_x64(True):
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
-        nothing = jnp.zeros(np.shape(starts), bool)
+        nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
         refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
         least = np.min(refined.cost)
         agreeing = int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))

@@ -23,7 +23,7 @@ from ehsvjax.precision.standard_errors import (
     precision_of,
     quantile_of,
 )
-from ehsvjax.record import Record
+from ehsvjax.record import Record, checked_record
 from ehsvjax.unknowns import problem_of
 
 
@@ -102,16 +102,17 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
         ValueError: if the record holds none of the outputs that were fitted.
 
     """
-    quantile, start = quantile_of(level), fit.initial_of(record, initial)
+    quantile, record = quantile_of(level), checked_record(record)
+    names = [name for name in record.outputs if name in fit.noise_variance]
+    if not names:
+        raise ValueError(f"expected {record.name} to hold one of {', '.join(fit.noise_variance)}, got none of them")
+    start = fit.initial_of(record, initial)
     found, covariance, factor = of.first_order.found, of.first_order.covariance, _sample_variance(fit, of)
     noise = np.sqrt(of.problem.noise_variance)
     for i, (fitted, estimated) in enumerate(zip(fit.records, fit.initial, strict=True)):
         if fitted is record and start == estimated:
             spread = deviations(found, covariance)[i, : len(record)]
             return _bands(of.problem.observed, spread, noise, factor, quantile)
-    names = [name for name in record.outputs if name in fit.noise_variance]
-    if not names:
-        raise ValueError(f"expected {record.name} to hold one of {', '.join(fit.noise_variance)}, got none of them")
     problem = _problem(fit, [record.select(outputs=names)], [start])
     values = [fit.parameters[name] for name in problem.free] + [start[name] for name in problem.free_initial]
     new = sensitivities(problem, np.array(values))
