@@ -1,4 +1,6 @@
-"""Limits of what is stored, holds, feedthroughs and pulsations: independent plants hide them, the package finds them."""
+"""Limits of what is stored, holds, feedthroughs, pulsations: independent plants hide them, the package finds them."""
+
+import itertools
 
 import jax
 import numpy as np
@@ -137,7 +139,7 @@ def pulsating_valve(command, period, amplitude, frequency):
 
     state, positions = np.zeros(5), []
     edges = [0, *(np.flatnonzero(np.diff(command)) + 1), len(command)]
-    for first, last in zip(edges[:-1], edges[1:], strict=True):
+    for first, last in itertools.pairwise(edges):
         times = period * np.arange(first, last + 1)
         found = solve_ivp(rates, times[[0, -1]], state, "LSODA", times, args=(command[first],), rtol=1e-8, atol=1e-10)
         positions.append(found.y[0, :-1])
