@@ -101,7 +101,7 @@ def test_derivatives_along_forces_are_right_on_a_machine_of_any_size(area, mass,
     _, slopes = bench.linearised(bench.nominal[None], every[None])
     for candidate in forces:
         (j,) = bench.columns_of(candidate)
-        # So small that they act in proportion, so large that no rounding shows: some hundredths of the pressure's force.
+        # So small that they act in proportion, so large that no rounding shows.
         unit = bench.problem.coordinates.upper[j]
         largest = {"constant_load": 1.0, "viscous_friction": 2.0, "hardening_spring": 1e4}[candidate.name]
         size = 1e-3 * area * supply * largest / unit
