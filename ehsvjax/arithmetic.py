@@ -109,9 +109,10 @@ def arithmetic(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np
         return found[steps]
 
     while True:
-        off = np.maximum(*(np.max(np.abs(at(k * here) - at(here)), axis=0) for k in (2, 4)))
         # Comparisons of a failed simulation with anything are NaN: nothing is known there.
-        squares = np.where(np.isfinite(off), off**2, np.inf)[measured] / np.broadcast_to(variance, off.shape)[measured]
+        with np.errstate(invalid="ignore", over="ignore"):
+            off = np.maximum(*(np.max(np.abs(at(k * here) - at(here)), axis=0) for k in (2, 4)))
+            squares = np.where(np.isfinite(off), off**2 / variance, np.inf)[measured]
         order = np.argsort(squares)
         below = np.cumsum(squares[order])
         kept = int(np.searchsorted(below, _WORTH, side="right"))

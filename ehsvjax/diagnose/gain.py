@@ -109,7 +109,7 @@ def _gain(before, after, readings, noise_variance, rng) -> OutputGain:
     removable = mean[0] - noise_variance
     share, low, high = (float("nan"),) * 3
     # A removable error within what noise does to a mean square is none.
-    if removable > 4.0 * noise_variance * np.sqrt(2.0 / len(before)):
+    if np.isfinite(mean).all() and removable > 4.0 * noise_variance * np.sqrt(2.0 / len(before)):
         share = float((mean[0] - mean[1]) / removable)
         drawn = _redrawn(squares, rng)
         # What is removable is taken as it is, for a short misfit would be in few of the drawn blocks: what is left of

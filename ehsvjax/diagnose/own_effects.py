@@ -47,7 +47,7 @@ def _check(bench: Workbench, candidate: Candidate) -> None:
     if empty:
         raise ValueError(f"expected {effect.name} to name values of {', '.join(empty)} to try, got none")
     gone = {n.name: n.absent if n.absent is not None else t[0] for n, t in zip(effect.parameters, tries, strict=True)}
-    value, without = _run(bench, candidate, gone)
+    value, without = _finite(bench, candidate, gone)
     size = float(np.max(np.abs(value)))
     if not np.max(np.abs(without - value)) <= _NOTHING * size:
         said = ", ".join(f"{n.name} = {n.absent:g}" for n in effect.parameters if n.absent is not None)
@@ -57,21 +57,26 @@ def _check(bench: Workbench, candidate: Candidate) -> None:
         )
     changes = []
     for values in itertools.product(*tries):
-        tried = dict(zip(gone, values, strict=True))
-        with_it = _run(bench, candidate, tried)[1]
-        if not np.all(np.isfinite(with_it)):
-            said = ", ".join(f"{name} = {number:g}" for name, number in tried.items())
-            first = with_it[~np.isfinite(with_it)][0]
-            raise ValueError(
-                f"expected finite values of {candidate.signal} from {effect.name}, got {first} at {said}: mind "
-                "divisions by zero and roots of negative numbers, also where jnp.where hides them"
-            )
+        with_it = _finite(bench, candidate, dict(zip(gone, values, strict=True)))[1]
         changes.append(float(np.max(np.abs(with_it - value))))
     if not max(changes) > 0.0:
         raise ValueError(
             f"expected {effect.name} to change {candidate.signal} at some value that it says to try, got no change at "
             "any: make its tries larger, or see whether it returns its value"
         )
+
+
+def _finite(bench: Workbench, candidate: Candidate, own) -> tuple[np.ndarray, np.ndarray]:
+    """Return what `_run` returns, if what an effect makes of a signal is finite."""
+    value, changed = _run(bench, candidate, own)
+    if not np.all(np.isfinite(changed)):
+        said = ", ".join(f"{name} = {number:g}" for name, number in own.items())
+        first = changed[~np.isfinite(changed)][0]
+        raise ValueError(
+            f"expected finite values of {candidate.signal} from {candidate.effect.name}, got {first} at {said}: mind "
+            "divisions by zero and roots of negative numbers, also where jnp.where hides them"
+        )
+    return value, changed
 
 
 def _run(bench: Workbench, candidate: Candidate, own) -> tuple[np.ndarray, np.ndarray]:
