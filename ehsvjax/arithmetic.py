@@ -17,11 +17,13 @@ from jaxtyping import Bool, Float
 
 from ehsvjax.population import Problem, cast, simulated
 
-# Noise variances that the arithmetic of one simulation may be worth: two of them then differ by .3 at most in 5 records
-# of noise out of 6, and hardly ever by one.
-_WORTH = 0.01
+# Noise variances that the arithmetic of one simulation may be worth: what it adds to the difference of two sums of
+# squares then has a deviation of .6 if their errors have nothing in common, and hardly any if they are alike.
+_WORTH = 0.05
 # Share of the readings that are left out before the step is halved.
-_LEFT_OUT = 0.02
+_LEFT_OUT = 0.05
+ROUGHLY = 0.3
+"""The same where it is still far from the minimum: a step of a quarter would take four times as long."""
 # Of the outputs' own deviation: a noise below this is none that a sensor has, and no arithmetic is asked for it.
 _LEAST_NOISE = 1e-4
 # Parts of the step that a model asks for, below which no step is tried.
@@ -62,9 +64,9 @@ def outputs_of(
 _outputs = jax.jit(simulated)
 
 
-def settled_at(problem: Problem, individual: Float[np.ndarray, " parameter"]) -> Problem:
+def settled_at(problem: Problem, individual: Float[np.ndarray, " parameter"], left_out: float = _LEFT_OUT) -> Problem:
     """Return the problem settled for one individual, under its own noise."""
-    return settled(problem, _outputs_at(problem, individual), problem.noise_variance)
+    return settled(problem, _outputs_at(problem, individual), problem.noise_variance, left_out)
 
 
 def arithmetic_at(problem: Problem, individual: Float[np.ndarray, " parameter"]) -> Arithmetic:
@@ -76,25 +78,36 @@ def _outputs_at(problem: Problem, individual) -> OutputsAt:
     return lambda substeps: outputs_of(replace(problem, substeps=np.int32(substeps)), individual)[None]
 
 
-def settled(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np.ndarray, " signal"]) -> Problem:
+def settled(
+    problem: Problem,
+    outputs_at: OutputsAt,
+    noise_variance: Float[np.ndarray, " signal"],
+    left_out: float = _LEFT_OUT,
+) -> Problem:
     """Return the problem at a step at which some simulations are as good as exact; itself if it is there already.
 
     Readings that no such step knows are no longer measured.
     """
-    found = arithmetic(problem, outputs_at, noise_variance)
+    found = arithmetic(problem, outputs_at, noise_variance, left_out)
     if found.substeps == problem.substeps and np.array_equal(found.known, problem.samples.measured):
         return problem
     known = problem.samples._replace(measured=found.known)
     return replace(problem, samples=known, substeps=np.int32(found.substeps))
 
 
-def arithmetic(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np.ndarray, " signal"]) -> Arithmetic:
+def arithmetic(
+    problem: Problem,
+    outputs_at: OutputsAt,
+    noise_variance: Float[np.ndarray, " signal"],
+    left_out: float = _LEFT_OUT,
+) -> Arithmetic:
     """Return the step at which some simulations are as good as exact, for all of them together.
 
     Args:
         problem: what is simulated; the step is not made longer than it is there.
         outputs_at: simulates, in the outputs' units.
         noise_variance: of each output, in its unit squared.
+        left_out: share of the readings that are left out before the step is halved.
 
     """
     readings, measured, here = problem.samples.outputs, problem.samples.measured, int(problem.substeps)
@@ -116,7 +129,7 @@ def arithmetic(problem: Problem, outputs_at: OutputsAt, noise_variance: Float[np
         order = np.argsort(squares)
         below = np.cumsum(squares[order])
         kept = int(np.searchsorted(below, _WORTH, side="right"))
-        if count - kept <= _LEFT_OUT * count:
+        if count - kept <= left_out * count:
             break
         if finest(replace(problem, substeps=here)):
             # Arithmetic is worth more than it should be everywhere: to leave out some of it would hide that.

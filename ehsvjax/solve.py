@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ehsvjax import genetic
-from ehsvjax.arithmetic import settled_at
+from ehsvjax.arithmetic import ROUGHLY, settled_at
 from ehsvjax.doubts import NO_CHANGE, residuals_at
 from ehsvjax.fit import Effort
 from ehsvjax.models.model import Model
@@ -93,7 +93,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     came to within a tenth of a noise variance of the same minimum, in the first round.
     """
     every = problem.samples
-    problem = settled_at(problem, np.asarray(starts[0]))
+    problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
     with jax.enable_x64(True):
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
         nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
