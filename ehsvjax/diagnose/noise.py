@@ -104,31 +104,23 @@ def noise_outside(
     standardised = np.where(measured, residual, 0.0) / deviation
     basis = _basis(np.where(measured, responses, 0.0) / deviation)
     left = standardised - _combined(basis, standardised)
-    noises: list[ResidualNoise] | None = None
-    count = int(measured.sum())
-    # What the projection took of the noise depends on the noise: three rounds settle it.
+    # Directions that were taken of each output, a share of one where it is in several.
+    taken = np.sum(basis**2, axis=(0, 1, 2))
+    variances = np.sum(left**2, axis=(0, 1)) / np.maximum(measured.sum(axis=(0, 1)) - taken, 1.0)
+    noises = [ResidualNoise(float("nan"), np.zeros(0), float(v), float(v)) for v in variances]
+    # What the projection took of the noise depends on the noise, first taken to be white: a few rounds settle it.
     for _ in range(4):
-        found = []
-        inside = None
-        if noises is not None:
-            inside = np.sum([meat(basis[..., i], noise) for i, noise in enumerate(noises)], axis=0)
-        for i in range(residual.shape[-1]):
-            absorbed = None
-            if noises is not None and inside is not None:
-                absorbed = absorbed_by_the_fit(
-                    basis[..., i], measured[..., i], noises[i], np.eye(basis.shape[-2]), inside
-                )
-            noise = residual_noise(left[..., i], measured[..., i], "auto", absorbed)
-            if absorbed is None and count > basis.shape[-2]:
-                scale = count / (count - basis.shape[-2])
-                noise = noise._replace(
-                    variance=noise.variance * scale, innovation_variance=noise.innovation_variance * scale
-                )
-            found.append(noise)
-        noises = found
+        inside = np.sum([meat(basis[..., i], noise) for i, noise in enumerate(noises)], axis=0)
+        absorbed = [
+            absorbed_by_the_fit(basis[..., i], measured[..., i], noise, np.eye(basis.shape[-2]), inside)
+            for i, noise in enumerate(noises)
+        ]
+        noises = [
+            residual_noise(left[..., i], measured[..., i], "auto", absorbed[i], float(taken[i]))
+            for i in range(residual.shape[-1])
+        ]
         if not any(len(noise.coefficients) for noise in noises):
             break
-    assert noises is not None
     in_units = [
         n._replace(variance=n.variance * d**2, innovation_variance=n.innovation_variance * d**2)
         for n, d in zip(noises, deviation, strict=True)

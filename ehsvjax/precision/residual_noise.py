@@ -50,6 +50,7 @@ def residual_noise(
     measured: Bool[np.ndarray, "record time"],
     colour: str,
     absorbed: Float[np.ndarray, " lag"] | None = None,
+    taken: float = 0.0,
 ) -> ResidualNoise:
     """Return the noise of one output's standardised residuals; zero where nothing is measured.
 
@@ -58,11 +59,14 @@ def residual_noise(
         measured: where there is a sample.
         colour: "white", "coloured" or "auto".
         absorbed: what the fit took of the autocovariance, see `absorbed_by_the_fit`; None for nothing.
+        taken: samples' worth of it that the fit took: what is left says as much less of the autocovariance.
 
     """
     count = int(measured.sum())
     covariance = _autocovariance(residuals, residuals, measured, lags_tried(count))
     covariance = covariance if absorbed is None else covariance + absorbed
+    # Where a share s was taken, correlations vary by 1/(1 - s) more than those of as many samples as are left.
+    count = max(int(count * (1.0 - taken / max(count, 1)) ** 2), 1)
     p_value = _ljung_box(covariance, count)
     white = ResidualNoise(p_value, np.zeros(0), float(covariance[0]), float(covariance[0]))
     if colour == "white" or covariance[0] == 0 or (colour == "auto" and not p_value < SUSPICION):
