@@ -334,7 +334,7 @@ def test_an_unknown_parameter():
             "expected the output that shows x0 of .* of kind 'sensor', distance, spring_force; got 'push'",
         ),
         ({"max_step": 0.0}, "expected max_step of oscillator to be positive, got 0.0: give seconds above 0"),
-        ({"max_step": float("nan")}, "expected max_step of oscillator to be positive, got nan"),
+        ({"max_step": float("nan")}, "expected max_step of oscillator to be a finite number, got nan"),
     ],
 )
 def test_a_model_that_cannot_be(change, sentence):
