@@ -62,6 +62,7 @@ def positive(name: str, value: Any, remedy: str = "give a number above 0") -> fl
         ValueError: for anything else.
 
     """
+    number(name, value, remedy=remedy)  # infinity is positive
     return number(name, value, "positive", lambda value: value > 0.0, remedy)
 
 

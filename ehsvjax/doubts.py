@@ -159,7 +159,7 @@ def residuals_at(
     return np.where(samples.measured, off, 0.0)
 
 
-def _variance(readings: Sequence[Float[np.ndarray, " time"]], robust: bool) -> float:
+def _variance(readings: Sequence[Float[np.ndarray, " _"]], robust: bool) -> float:
     """Return the variance of readings about their mean in each record, or by their median distance from the median."""
     if robust:
         about = np.concatenate([np.abs(y - np.nanmedian(y)) for y in readings])

@@ -46,6 +46,7 @@ def _of_quantities(function: Callable[_Quantities, Result]) -> Callable[_Quantit
 
     @functools.wraps(function)
     def checked(*args: _Quantities.args, **kwargs: _Quantities.kwargs) -> Result:
+        """Raise a ValueError for what is no quantity, or call the function."""
         given: dict[str, Any] = {**dict(zip(names, args, strict=False)), **kwargs}
         for name, value in given.items():
             if not is_numeric(value) or jnp.iscomplexobj(value):

@@ -74,9 +74,10 @@ IDENTIFY = [
     *(
         (
             {"noise_variance": {"level": value}},
-            f"expected noise_variance of level to be positive, got {value!r}: give it in (m)^2",
+            f"expected noise_variance of level to be {wanted}, got {value!r}: give it in (m)^2",
         )
-        for value in (0, -1.0, np.nan, np.inf, "1e-4", None, True)
+        for wanted, values in (("positive", (0, -1.0)), ("a finite number", (np.nan, np.inf, "1e-4", None, True)))
+        for value in values
     ),
     *(
         (

@@ -131,7 +131,7 @@ def test_islands_that_cannot_be():
         _identified(_record(), islands=3, devices=BOTH)
     with pytest.raises(ValueError, match="expected islands to be a whole number of at least 1, got 0"):
         _identified(_record(), islands=0)
-    with pytest.raises(ValueError, match="expected devices such as jax.devices"):
+    with pytest.raises(ValueError, match="expected devices to be some of jax.devices"):
         _identified(_record(), devices=())
 
 

@@ -311,7 +311,9 @@ def test_progress_bar_and_checkpoint_change_nothing(record, fit, tmp_path, capfd
     with pytest.raises(ValueError, match="expected .* to be the checkpoint of this search, got one of another"):
         _identified(_oscillator(seed=1), checkpoint=tmp_path / "run")
     (tmp_path / "other").write_text("no checkpoint")
-    with pytest.raises(ValueError, match="expected a checkpoint of a search"):
+    with pytest.raises(
+        ValueError, match="other cannot be read as a checkpoint of a search .*: remove it or name a new"
+    ):
         _identified(record, checkpoint=tmp_path / "other")
 
 
@@ -321,14 +323,14 @@ def test_progress_bar_and_checkpoint_change_nothing(record, fit, tmp_path, capfd
         ({"fixed": {"mass": 1.0}}, "expected a parameter of Van der Pol oscillator, got 'mass'; it has alpha, gamma"),
         ({"bounds": {"alpha": (2.0, 1.0)}}, "expected finite bounds of alpha with lower < upper"),
         ({"bounds": {"alpha": (0.5, 1.0)}, "fixed": {"alpha": 0.9}}, "either bounded or fixed, got both for alpha"),
-        ({"initial": "unknown"}, "expected initial 'estimate', 'nominal' or known values"),
+        ({"initial": "unknown"}, "expected initial to be 'estimate', 'nominal' or known values"),
         ({"initial": {"speed": 1.0}}, "expected an initial condition of Van der Pol oscillator, got 'speed'"),
         ({"noise_variance": {"speed": 1.0}}, "expected the noise variance of each measured output"),
-        ({"noise_variance": {"position": -1.0}}, "expected a positive noise variance of position"),
+        ({"noise_variance": {"position": -1.0}}, "expected noise_variance of position to be positive, got -1.0"),
         ({"population": 2}, "expected population to be a whole number of at least 4, got 2"),
         ({"generations": 0}, "expected generations to be a whole number of at least 1, got 0"),
         ({"huber": -1.0}, "expected huber to be a positive number of standard deviations"),
-        ({"starts": 0}, "expected starts to be a whole number of at least 1"),
+        ({"starts": 0}, "expected starts to be a whole number from 1 to "),
         ({"tolerance": -1.0}, "expected tolerance to be zero or more"),
         ({"operators": ehsvjax.Operators(elites=0)}, "elites"),
         ({"operators": ehsvjax.Operators(immigrants=1.0)}, "expected immigrants to be a share"),

@@ -327,7 +327,7 @@ def test_oil_as_soft_as_a_spring_stays_finite():
 
 def test_an_unknown_place_of_the_transfer_function():
     with pytest.raises(
-        ValueError, match="expected transfer_function to be 'valve' or 'forward' or 'return', got 'spool': choose one"
+        ValueError, match="expected transfer_function to be 'valve', 'forward' or 'return', got 'spool': choose one"
     ):
         unchecked(servovalve)(transfer_function="spool")
 

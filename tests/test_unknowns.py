@@ -133,7 +133,11 @@ MODEL = ehsvjax.van_der_pol()
             {"noise_variance": {"position": 0.0}},
             "noise_variance of position to be positive, got 0.0: give it in",
         ),
-        (MODEL, {"noise_variance": {"position": np.inf}}, "expected noise_variance of position to be positive"),
+        (
+            MODEL,
+            {"noise_variance": {"position": np.inf}},
+            "noise_variance of position to be a finite number, got inf: give it in",
+        ),
         (MODEL, {"huber": 0.0}, "expected huber to be a positive number of standard deviations"),
         (MODEL, {"huber": float("nan")}, "expected huber to be a positive number"),
         (

@@ -70,6 +70,7 @@ def _checked(
     kinds = dict(signals)
 
     def signal(name, value, **context):
+        """Raise a ValueError for a signal that is not listed, or pass the value on."""
         if name not in kinds:
             raise unlisted(model, name, kinds)
         passed.add(name)
