@@ -90,7 +90,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     """Refine; then, while weights, step or readings that are known change, refine again with those found there.
 
     With one output and squared residuals its weight does not move the minimum. The number returned says how many starts
-    came to within a tenth of a noise variance of the same minimum, in the first round.
+    came to the same minimum.
     """
     every = problem.samples
     problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
@@ -98,8 +98,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
         nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
         refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
-        least = np.min(refined.cost)
-        agreeing = int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))
+        agreeing = _agreeing(problem, refined)
         several = len(problem.observed) > 1 or problem.huber is not None
         for _ in range(_ROUNDS):
             best = np.argmin(refined.cost)
@@ -112,10 +111,16 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
             if same and (not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
                 break
             problem = known
-            # From the best alone, as often as there were starts: the same shape is not compiled again.
-            again = np.broadcast_to(refined.individual[best], refined.individual.shape)
-            refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(again), held=nothing))
+            # From where each start has led: what kept them apart may have been the arithmetic.
+            refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(refined.individual), held=nothing))
+            agreeing = _agreeing(problem, refined)
         return refined, agreeing, problem
+
+
+def _agreeing(problem: Problem, refined: Refined) -> int:
+    """Return how many starts came to within a tenth of a noise variance of the best."""
+    least = np.min(refined.cost)
+    return int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))
 
 
 def _in_numpy(refined: Refined) -> Refined:

@@ -86,7 +86,7 @@ def test_a_position_alone_is_simulated_as_before(valve):
 def test_a_fit_says_which_step_and_how_many_readings_are_left_out(valve):
     fit = ehsvjax.identify(ehsvjax.servovalve(), valve.record, key=KEY, population=50, generations=20)
     assert 0 < fit.effort.left_out <= 0.03 * 2 * SAMPLES
-    assert fit.effort.arithmetic <= 0.01
+    assert fit.effort.arithmetic <= 0.05
     assert f"{fit.effort.left_out}" in str(fit) and f"{1e3 * fit.effort.step_size:.3g} ms" in str(fit)
     for name, deviation in NOISE.items():
         # Of 2,000 readings the standard deviation is known to 1.6%.
@@ -198,7 +198,7 @@ def test_what_is_known_is_off_by_less_than_it_is_said_to_be_worth(errors, order)
     assert off.sum() <= found.worth * (1.0 + 1e-9) + 1e-12
     # Readings that are left out are off by more than any that is kept.
     left_out = ((finer - here) ** 2)[~found.known]
-    assert left_out.size <= 0.02 * 40 and not (off.size and left_out.size and left_out.min() < off.max() - 1e-12)
+    assert left_out.size <= 0.05 * 40 and not (off.size and left_out.size and left_out.min() < off.max() - 1e-12)
 
 
 @settings(max_examples=60, deadline=None)
