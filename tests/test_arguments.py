@@ -87,6 +87,9 @@ IDENTIFY = [
         for value in (0, -1.0, np.nan, "1.345", True, np.ones(2))
     ),
     ({"operators": None}, "expected operators to be an Operators, got None: take"),
+    ({"operators": ehsvjax.Operators(selection="best")}, "expected selection to be a function, such as"),
+    ({"operators": ehsvjax.Operators(elites=True)}, "expected elites to be a whole number from 1 to 99, got True"),
+    ({"operators": ehsvjax.Operators(immigrants="few")}, "expected immigrants to be a share of the population"),
     *(
         ({"tolerance": value}, f"expected tolerance to be zero or more noise variances, got {value!r}")
         for value in (np.nan, -1.0, "0.1", None, np.inf)
@@ -128,6 +131,17 @@ FIT = [
         (lambda fit, level=level: fit.bands(level=level), "a confidence level between 0 and 1")
         for level in (0.0, 1.0, 95, -0.5, "0.95", None, np.nan, True)
     ),
+    *(
+        (lambda fit, start=start: fit.bands(initial=start), words)
+        for start, words in (
+            (None, "expected initial to be 'estimate', 'nominal' or values by name, got None"),
+            ({"strat": 1.0}, "expected an initial condition of growth, got 'strat'"),
+        )
+    ),
+    (lambda fit: fit.score(None), "expected record to be a Record, got None"),
+    (lambda fit: fit.save(None), "expected path to be the path of a file, got None"),
+    (lambda fit: fit.save(ROOT), "to be a file to write, got a folder: name a file in it"),
+    (lambda fit: fit.bootstrap(KEY, 10**15), "expected a bootstrap that fits into this machine's memory of"),
     (lambda fit: fit.precision("pink"), "expected noise to be 'auto', 'white' or 'coloured', got 'pink'"),
     (lambda fit: fit.precision(None), "expected noise to be 'auto', 'white' or 'coloured', got None"),
     (lambda fit: fit.precision(["white"]), "expected noise to be 'auto', 'white' or 'coloured', got ['white']"),
