@@ -7,6 +7,7 @@ import numpy as np
 from ehsvjax.diagnose.noise import plain_noise
 from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.selection import Selection
+from ehsvjax.doubts import about_arithmetic
 from ehsvjax.effects.effect import UNLIMITED
 from ehsvjax.effects.extended import extended
 from ehsvjax.fit import Effort, Fit, History, at_bound
@@ -52,6 +53,22 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
     if bench.problem.substeps > bench.problem.grid.substeps:
         model = replace(model, max_step=record.sample_period / int(bench.problem.substeps))
     parameters = {name: float(values[name]) for name in model.free}
+    # Nothing was searched: it was refined from the fit that was diagnosed, by squares, spikes left out.
+    effort = Effort(
+        population=0,
+        generations=0,
+        stopped_early=False,
+        simulations=0,
+        refined=True,
+        iterations=0,
+        starts=1,
+        starts_agreeing=1,
+        converged=bool(refits.converged[0]),
+        remaining=float("nan"),
+        arithmetic=selection.integration.worth,
+        step_size=record.sample_period / int(bench.problem.substeps),
+        left_out=sum(selection.integration.left_out.values()),
+    )
     return replace(
         bench.fit,
         model=model,
@@ -59,24 +76,10 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
         parameters=parameters,
         initial=(initial,),
         noise_variance=_variances(selection, refits),
-        # Nothing was searched: it was refined from the fit that was diagnosed, by squares, spikes left out.
+        effort=effort,
         history=History(*(np.zeros(0),) * 4, best={}),
-        effort=Effort(
-            population=0,
-            generations=0,
-            stopped_early=False,
-            simulations=0,
-            refined=True,
-            iterations=0,
-            starts=1,
-            starts_agreeing=1,
-            converged=bool(refits.converged[0]),
-            remaining=float("nan"),
-            step_size=record.sample_period / int(bench.problem.substeps),
-            left_out=int(np.isfinite(list(record.outputs.values())).sum() - bench.problem.samples.measured.sum()),
-        ),
         huber=None,
-        warnings=_at_bounds(model, parameters),
+        warnings=(*about_arithmetic(model, effort), *_at_bounds(model, parameters)),
     )
 
 

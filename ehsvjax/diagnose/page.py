@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from ehsvjax.checks import file_path
 from ehsvjax.diagnose import words
 from ehsvjax.diagnose.diagnosis import Diagnosis
 from ehsvjax.diagnose.pictures import plot_diagnosis
@@ -39,7 +40,7 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
         picture=embedded(to_png(plot_diagnosis(diagnosis))),
         fitted=embedded(to_png(plot_fit(diagnosis.extended, diagnosis.record))),
     )
-    file = Path(path)
+    file = Path(file_path("path", path))
     file.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(file) as whole:
         whole.write(page.encode())

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Key
 
+from ehsvjax.checks import flag
 from ehsvjax.diagnose.diagnosis import Diagnosis
 from ehsvjax.diagnose.examination import Examination, examine, remaining_term
 from ehsvjax.diagnose.extension import as_fit
@@ -60,7 +61,7 @@ def diagnose(
 
     """
     bank = _check_bank(bank)
-    _check(fit, record, validation, key)
+    _check(fit, record, validation, key, progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     with progress_bar(progress) as say:
         return _diagnosed(fit, record, validation, bank, rng, say)
@@ -113,7 +114,7 @@ def _judged(examined: Examination, nominal: Fit, validation: Record | None, rng:
     return wider, gain_of(selection, nominal, wider, validation, rng), verdict_of(examined)
 
 
-def _check(fit, record, validation, key) -> None:
+def _check(fit, record, validation, key, progress) -> None:
     if not isinstance(fit, Fit):
         raise ValueError(f"expected a fit as identify returns it, got {type(fit).__name__}")
     for name, one in (("record", record), ("validation", validation)):
@@ -130,6 +131,8 @@ def _check(fit, record, validation, key) -> None:
             f"{', '.join(sorted(set(record.outputs) - set(fit.outputs)))}: drop them with .select, or fit them too"
         )
     check_key(key)
+    if progress is not None:
+        flag("progress", progress)
     for one in (record, *([] if validation is None else [validation])):
         input_array(fit.model, one)
     measured = min(int(np.isfinite(record.outputs[name]).sum()) for name in record.outputs)
