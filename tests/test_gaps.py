@@ -62,7 +62,10 @@ def test_one_lost_row_is_interpolated_and_two_are_a_gap(lost, jitter, finer):
     even = record.resample(1.0 / finer)
     missing = np.isnan(even.outputs["position"])
     inside = (even.time > time[19] + 2e-6) & (even.time < time[20] - 2e-6)
-    assert missing[inside].all() == (lost > 1) and not missing[~inside].any()
+    # A place is known to a millionth of a step, and the step is up to four periods: there either is right.
+    edge = np.min(np.abs(even.time[:, None] - time[[19, 20]]), axis=1)
+    outside = ~inside & ((edge > 2e-6) | (edge == 0.0))
+    assert missing[inside].all() == (lost > 1) and not missing[outside].any()
     grid = np.minimum(even.time, time[-1])
     np.testing.assert_allclose(even.outputs["position"][~missing], grid[~missing], atol=1e-5)
 

@@ -10,7 +10,7 @@ from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
-_ITERATIONS = 30
+_ITERATIONS = 60
 # A start is given up if so many steps like the next would not bring it to the best, after a few.
 _HOPELESS = 5.0
 _PATIENCE = 4
