@@ -9,7 +9,6 @@ from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
 from ehsvjax.diagnose.dependence import strongest_dependence
-from ehsvjax.diagnose.jumps import without_jumps
 from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
@@ -200,7 +199,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits) -> Stage:
         tried = responses_at(bench, current, included, plain, trials.parts)
         spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
         white = noise_outside(current.residual[0], measured, spanned)
-        known = without_jumps(settled(bench, current.points, white.variances), current, white)
+        known = settled(bench, current.points, white.variances)
         if known is bench:
             break
         trials = trials._replace(bench=known)
