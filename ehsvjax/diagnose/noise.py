@@ -38,14 +38,16 @@ class Whitening(NamedTuple):
 
     def __call__(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
         """Return the whitened samples that can be used."""
+        from scipy.signal import lfilter  # slow to import
+
         parts = []
         for i, noise in enumerate(self.noises):
-            whitened = series[..., i].astype(float, copy=True)
-            for lag, coefficient in enumerate(noise.coefficients, start=1):
-                whitened[..., lag:] -= coefficient * series[..., :-lag, i]
+            whitened = series[..., i]
             order = len(noise.coefficients)
             if order:
-                whitened[..., :order] = series[..., :order, i] @ _first_innovations(noise).T
+                first = whitened[..., :order] @ _first_innovations(noise).T
+                whitened = lfilter(np.concatenate([[1.0], -noise.coefficients]), 1.0, whitened, axis=-1)
+                whitened[..., :order] = first
             parts.append(whitened[..., self.used[..., i]] / np.sqrt(noise.innovation_variance))
         return np.concatenate(parts, axis=-1)
 

@@ -1,6 +1,6 @@
 """What could be there instead of an effect that was found: its rivals, refitted in its place."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -86,6 +86,25 @@ def rivals_of_all(
     return included, final, tuple(groups)
 
 
+def rivals_again(
+    trials: Trials, included: tuple[int, ...], final: Refits, groups: Sequence[Sequence[Rival]], white: Whitening
+) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
+    """Return the same as `rivals_of_all` from where all have been refitted, under another step or noise."""
+    ranked = []
+    for own, group in zip(included, groups, strict=True):
+        rest = tuple(j for j in included if j != own)
+        starts = [[r.refitted.points[0]] for r in group if r.candidate != own]
+        others = [r.candidate for r in group if r.candidate != own]
+        led = refit_sets(trials, starts, [(*rest, i) for i in others], white, race=True) if others else None
+        found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
+        ranked.append(_ranked(trials, own, {own: final} | found))
+    for own, group in zip(included, ranked, strict=True):
+        if group[0].candidate != own:
+            included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
+            break
+    return included, final, tuple(ranked)
+
+
 def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, white: Whitening) -> tuple[Rival, ...]:
     """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
@@ -99,9 +118,14 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
         here = refit(bench, start[None], current.chosen, white, iterations=1)
         for candidate, refitted in _refitted_from(trials, here, own, rest, white, thoroughly=True).items():
             found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
+    return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)})
+
+
+def _ranked(trials: Trials, own: int, found: Mapping[int, Refits]) -> tuple[Rival, ...]:
+    """Return what was refitted in the place of an effect, the best first, with how much worse each is."""
     rivals = [
-        Rival(candidate, _cost(refitted) + PER_NUMBER * bench.numbers_of(candidate), refitted)
-        for candidate, refitted in (found | {own: min(found.get(own, final), final, key=_cost)}).items()
+        Rival(candidate, _cost(refitted) + PER_NUMBER * trials.bench.numbers_of(candidate), refitted)
+        for candidate, refitted in found.items()
         if np.isfinite(_cost(refitted))
     ]
     rivals.sort(key=lambda rival: rival.deficit)

@@ -12,7 +12,7 @@ from ehsvjax.diagnose.dependence import strongest_dependence
 from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
-from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_of_all
+from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_again, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
 from ehsvjax.diagnose.trials import (
     REFITTED_TOGETHER,
@@ -31,7 +31,7 @@ SIGNIFICANT = 0.002
 _MOST_EFFECTS = 3
 # Rounds of swaps, deletions and new looks, in which the causes settle.
 _ROUNDS = 6
-# Deficit of rivals whose arithmetic a verdict stands on.
+# Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
 _WEIGHED = 25.0
 # A term of free form that explains so much more than the best candidate shows that the bank lacks something.
 _BANK_LACKS_IT = 3.0
@@ -59,7 +59,7 @@ class Integration(NamedTuple):
         step_size: s.
         left_out: output -> readings that no such step knows, such as those beside a jump: they carry no weight.
         worth: noise variances by which halving the step changes the difference of any two explanations' sums of
-            squares, at most.
+            squares, at most; of what is more than 25 behind, in twenty-fifths of that.
 
     """
 
@@ -120,46 +120,86 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         if found is None:
             break
         stages.append(found)
-    last = stages[-1]
     progress("refitting the rivals", 0.5)
+    last = stages.pop()
     for rounds_left in reversed(range(_ROUNDS)):
-        trials, white = last.trials, last.white
-        included, final, rivals = rivals_of_all(trials, last.included, last.current, white)
-        nominal = refit_sets(trials, [[stages[0].current.points[0]]], [()], white)
-        gains, needless = _gains(trials, included, final, nominal, last)
-        known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), white)
-        same = needless is None and set(included) == set(last.included)
-        if rounds_left == 0 or (same and known is trials.bench):
+        weighed = _weighed(last, stages[0].current if stages else last.current)
+        needless = weighed.needless
+        if not rounds_left or (needless is None and set(weighed.stage.included) == set(last.included)):
             break
+        last = weighed.stage
         if needless is not None:
             # What was added first can become needless by what was added later.
-            included = tuple(j for j in included if j != needless)
-            start = without(trials.bench, final.points[0], needless)
-            final = refit_sets(trials, [[start]], [included], white)
-        last = _look(trials._replace(bench=known), included, final)
+            start = without(last.trials.bench, last.current.points[0], needless)
+            rest = tuple(j for j in last.included if j != needless)
+            last = last._replace(included=rest, current=refit_sets(last.trials, [[start]], [rest], last.white))
+        last = _look(last.trials, last.included, last.current)
+    last = weighed.stage
     return Selection(
-        bench=trials.bench,
-        seen=trials.seen,
-        included=included,
-        final=final,
-        nominal=nominal,
-        white=white,
-        stages=(*stages[:-1], last),
-        rivals=rivals,
-        gains=tuple(gains),
-        integration=_integration(begun, trials.bench, worth),
+        bench=last.trials.bench,
+        seen=last.trials.seen,
+        included=last.included,
+        final=last.current,
+        nominal=weighed.nominal,
+        white=last.white,
+        stages=(*stages, last),
+        rivals=weighed.rivals,
+        gains=weighed.gains,
+        integration=_integration(begun, last.trials.bench, weighed.worth),
     )
 
 
+class _Weighed(NamedTuple):
+    """The causes of a stage, each in the best form of its rivals, and all that they are compared with.
+
+    Attributes:
+        stage: with the causes after swaps for better rivals, at the step that all that is compared needs.
+        nominal: the refit without any, under the same noise.
+        rivals: for each cause all that was refitted in its place, the best first.
+        gains: for each cause how much worse the fit is without it, in noise variances.
+        needless: the cause that is needed least, if the record can do without it.
+        worth: noise variances by which halving the step changes the difference of any two of them.
+
+    """
+
+    stage: Stage
+    nominal: Refits
+    rivals: tuple[tuple[Rival, ...], ...]
+    gains: tuple[float, ...]
+    needless: int | None
+    worth: float
+
+
+def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
+    """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
+    included, final, rivals = rivals_of_all(stage.trials, stage.included, stage.current, stage.white)
+    stage = stage._replace(included=included, current=final)
+    while True:
+        trials, white = stage.trials, stage.white
+        nominal = refit_sets(trials, [[nominal.points[0]]], [()], white)
+        known, worth = _settled_for_all(trials.bench, _compared(stage.current, nominal, rivals), white)
+        if known is trials.bench:
+            gains, needless = _gains(stage, nominal)
+            return _Weighed(stage, nominal, rivals, gains, needless, worth)
+        # Nothing is looked for again: what was found is refitted from where it is.
+        stage = _look(trials._replace(bench=known), stage.included, stage.current)
+        included, final, rivals = rivals_again(stage.trials, stage.included, stage.current, rivals, stage.white)
+        stage = stage._replace(included=included, current=final)
+
+
 def _settled_for_all(bench: Workbench, points, white: Whitening) -> tuple[Workbench, float]:
-    """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them."""
+    """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them.
+
+    The first is the best. Where another is far behind, its arithmetic counts as a part of that.
+    """
     known = settled(bench, points, white.variances)
     here = int(known.problem.substeps)
-    costs = [
+    coarse, fine = (
         np.sum(white(known.problem.samples.outputs - known.simulated(points, substeps=substeps)) ** 2, axis=-1)
         for substeps in (here, 2 * here)
-    ]
-    worth = float(np.ptp(costs[1] - costs[0]))
+    )
+    behind = np.maximum(1.0, (fine - fine[0]) / _WEIGHED)
+    worth = float(np.max(np.abs((fine - coarse) - (fine - coarse)[0]) / behind))
     if known is bench and worth > 1.0 and not finest(known.problem):
         return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
     return known, worth
@@ -285,14 +325,15 @@ def _is_gain(stage: Stage, extended: Refits, candidate: int) -> bool:
     return bool(both.cost[0] - both.cost[1] > required)
 
 
-def _gains(trials: Trials, included, final: Refits, nominal: Refits, last: Stage):
+def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None]:
     """Return how much worse the fit is without each effect, and the one that is needed least, if it is needless."""
+    trials, final = stage.trials, stage.current
     gains, spare = [], {}
-    for i in included:
-        rest = tuple(j for j in included if j != i)
+    for i in stage.included:
+        rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
-        gain = float(refit_sets(trials, [[start]], [rest], last.white).cost[0] - final.cost[0])
+        gain = float(refit_sets(trials, [[start]], [rest], stage.white).cost[0] - final.cost[0])
         gains.append(gain)
-        spare[i] = gain - required_gain(trials.bench, last.screening, i)
+        spare[i] = gain - required_gain(trials.bench, stage.screening, i)
     least = min(spare, key=lambda i: spare[i], default=None)
-    return gains, least if len(included) > 1 and least is not None and spare[least] < 0.0 else None
+    return tuple(gains), least if len(spare) > 1 and least is not None and spare[least] < 0.0 else None

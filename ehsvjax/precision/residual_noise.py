@@ -79,15 +79,22 @@ def meat(
     jacobian: Float[np.ndarray, "record time parameter"], noise: ResidualNoise
 ) -> Float[np.ndarray, "parameter parameter"]:
     """Return J^T Sigma J over the records, for one output; rows of J without a sample are zero."""
-    record_count, length, parameters = jacobian.shape
+    flat = jacobian.reshape(-1, jacobian.shape[-1])
     if not len(noise.coefficients):
-        flat = jacobian.reshape(-1, parameters)
         return noise.variance * flat.T @ flat
-    # A Toeplitz matrix is a convolution: twice the length, so that it does not wrap round.
-    size = 2 * length
-    transformed = np.fft.fft(jacobian, size, axis=1).reshape(-1, parameters)
-    spectrum = np.tile(noise.spectrum(size), record_count)
-    return np.real(transformed.conj().T @ (spectrum[:, None] * transformed)) / size
+    return flat.T @ _correlated(jacobian, noise).reshape(flat.shape)
+
+
+def _correlated(
+    jacobian: Float[np.ndarray, "record time parameter"], noise: ResidualNoise
+) -> Float[np.ndarray, "record time parameter"]:
+    """Return Sigma J. A Toeplitz matrix is a convolution: twice the length, so that it does not wrap round."""
+    from scipy.fft import irfft, next_fast_len, rfft
+
+    length = jacobian.shape[1]
+    size = next_fast_len(2 * length, real=True)
+    power = noise.spectrum(size)[: size // 2 + 1, None]
+    return irfft(power * rfft(jacobian, size, axis=1), size, axis=1)[:, :length]
 
 
 def absorbed_by_the_fit(
@@ -110,18 +117,11 @@ def absorbed_by_the_fit(
         inside: J^T Sigma J over all outputs.
 
     """
-    length = jacobian.shape[1]
-    spectrum = noise.spectrum(2 * length)[:, None]
-    through = np.real(np.fft.ifft(spectrum * np.fft.fft(jacobian, 2 * length, axis=1), axis=1))[:, :length]
-    through = np.where(measured[..., None], through, 0.0)
+    through = np.where(measured[..., None], _correlated(jacobian, noise), 0.0)
     taken, once = jacobian @ bread, through @ bread
     twice = taken @ inside @ bread
     lags = lags_tried(int(measured.sum()))
-    return (
-        _autocovariance(taken, through, measured, lags)
-        + _autocovariance(once, jacobian, measured, lags)
-        - _autocovariance(twice, jacobian, measured, lags)
-    )
+    return _autocovariance(taken, through, measured, lags) + _autocovariance(once - twice, jacobian, measured, lags)
 
 
 def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
@@ -149,7 +149,7 @@ def _autocovariance(first, second, measured, lags: int) -> Float[np.ndarray, " l
         pairs = np.sum(measured[:, : length - lag] & measured[:, lag:])
         # Over all samples, not over the pairs: the sequence then stays positive definite where nothing is missing.
         share = pairs / max(np.sum(measured), 1) if measured.all() else 1.0
-        product = np.sum(first[:, : length - lag] * second[:, lag:])
+        product = np.tensordot(first[:, : length - lag], second[:, lag:], first.ndim)
         covariance.append(product / max(pairs, 1) * share)
     return np.array(covariance)
 
