@@ -20,8 +20,8 @@ from ehsvjax.population import Problem, cast, simulated
 # Noise variances that the arithmetic of one simulation may be worth: what it adds to the difference of two sums of
 # squares then has a deviation of .6 if their errors have nothing in common, and hardly any if they are alike.
 _WORTH = 0.05
-# Share of the readings that are left out before the step is halved.
-_LEFT_OUT = 0.05
+LEFT_OUT = 0.05
+"""Share of an output's readings that are left out before the step is halved."""
 ROUGHLY = 0.3
 """The same where it is still far from the minimum: a step of a quarter would take four times as long."""
 # Of the outputs' own deviation: a noise below this is none that a sensor has, and no arithmetic is asked for it.
@@ -64,7 +64,7 @@ def outputs_of(
 _outputs = jax.jit(simulated)
 
 
-def settled_at(problem: Problem, individual: Float[np.ndarray, " parameter"], left_out: float = _LEFT_OUT) -> Problem:
+def settled_at(problem: Problem, individual: Float[np.ndarray, " parameter"], left_out: float = LEFT_OUT) -> Problem:
     """Return the problem settled for one individual, under its own noise."""
     return settled(problem, _outputs_at(problem, individual), problem.noise_variance, left_out)
 
@@ -82,7 +82,7 @@ def settled(
     problem: Problem,
     outputs_at: OutputsAt,
     noise_variance: Float[np.ndarray, " signal"],
-    left_out: float = _LEFT_OUT,
+    left_out: float = LEFT_OUT,
 ) -> Problem:
     """Return the problem at a step at which some simulations are as good as exact; itself if it is there already.
 
@@ -99,7 +99,7 @@ def arithmetic(
     problem: Problem,
     outputs_at: OutputsAt,
     noise_variance: Float[np.ndarray, " signal"],
-    left_out: float = _LEFT_OUT,
+    left_out: float = LEFT_OUT,
 ) -> Arithmetic:
     """Return the step at which some simulations are as good as exact, for all of them together.
 
@@ -107,13 +107,12 @@ def arithmetic(
         problem: what is simulated; the step is not made longer than it is there.
         outputs_at: simulates, in the outputs' units.
         noise_variance: of each output, in its unit squared.
-        left_out: share of the readings that are left out before the step is halved.
+        left_out: share of each output's readings that are left out before the step is halved.
 
     """
     readings, measured, here = problem.samples.outputs, problem.samples.measured, int(problem.substeps)
     spread = np.array([np.var(readings[..., i][measured[..., i]]) for i in range(readings.shape[-1])])
     variance = np.maximum(noise_variance, _LEAST_NOISE**2 * spread)
-    count = int(measured.sum())
     found: dict[int, np.ndarray] = {}
 
     def at(steps: int) -> Float[np.ndarray, "individual record time signal"]:
@@ -129,15 +128,20 @@ def arithmetic(
         order = np.argsort(squares)
         below = np.cumsum(squares[order])
         kept = int(np.searchsorted(below, _WORTH, side="right"))
-        if count - kept <= left_out * count:
+        known = measured.copy()
+        known[measured] = np.isin(np.arange(len(order)), order[:kept])
+        if few(measured & ~known, measured, left_out):
             break
         if finest(replace(problem, substeps=here)):
             # Arithmetic is worth more than it should be everywhere: to leave out some of it would hide that.
-            kept = count
+            known, kept = measured, len(order)
             break
         here *= 2
-    known = np.zeros(count, bool)
-    known[order[:kept]] = True
-    everywhere = measured.copy()
-    everywhere[measured] = known
-    return Arithmetic(here, everywhere, float(below[kept - 1]) if kept else 0.0)
+    return Arithmetic(here, known, float(below[kept - 1]) if kept else 0.0)
+
+
+def few(
+    some: Bool[np.ndarray, "record time signal"], measured: Bool[np.ndarray, "record time signal"], share: float
+) -> bool:
+    """Whether some readings are at most this share of those of each output."""
+    return bool(np.all(some.sum(axis=(0, 1)) <= share * measured.sum(axis=(0, 1))))

@@ -86,6 +86,13 @@ def curves_of_tests(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " tim
     return coarse + [_waves_along(bench, place, name, seen[name], waves) for place in bench.places for name in outputs]
 
 
+def responses_of_tests(
+    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, " time"]]
+) -> Float[np.ndarray, "piece record time signal"]:
+    """Return what the pieces of all tests' curves do to the outputs of a point."""
+    return curve_responses(bench, point, curves_of_tests(bench, seen))
+
+
 def straight_along(
     bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, " time"]], pieces: int
 ) -> Curve:
@@ -185,7 +192,7 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
         acting = _acting(bench, curve, curve.pieces)
         added[row : row + len(curve.pieces), 0, :, bench.places.index(curve.place)] = acting
         row += len(curve.pieces)
-    outputs = bench.simulated(np.repeat(point[None], len(added), axis=0), added) if inside else None
+    outputs = bench.sketched(np.repeat(point[None], len(added), axis=0), added) if inside else None
     changes, row = [], 1
     for curve in curves:
         if curve.place in bench.places:

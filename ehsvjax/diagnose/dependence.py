@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.curves import Curve, curve_responses, curves_of_tests, single_waves, waves_in
+from ehsvjax.diagnose.curves import Curve, curves_of_tests, single_waves, waves_in
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
@@ -40,7 +40,11 @@ class Dependence(NamedTuple):
 
 
 def dependences(
-    bench: Workbench, final: Refits, white: Whitening, seen: Mapping[str, Float[np.ndarray, " time"]]
+    bench: Workbench,
+    final: Refits,
+    white: Whitening,
+    seen: Mapping[str, Float[np.ndarray, " time"]],
+    responses: Float[np.ndarray, "piece record time signal"],
 ) -> tuple[Dependence, ...]:
     """Test whether a residual still depends on anything, the most significant first.
 
@@ -49,9 +53,10 @@ def dependences(
         final: the refit whose residual is judged.
         white: of its noise.
         seen: the quantities.
+        responses: of the tests' curves (`responses_of_tests`), there or near.
 
     """
-    tests, r = _examined(bench, final, white, seen)
+    tests, r = _examined(bench, final, white, seen, responses)
     components = [(test.basis.T @ r)[None] for test in tests]
     p_values = [float(test.p_value(c)[0]) for test, c in zip(tests, components, strict=True)]
     null = smallest_p_values([test.basis for test in tests], [test.p_value for test in tests], seed=1)
@@ -66,10 +71,14 @@ def dependences(
 
 
 def strongest_dependence(
-    bench: Workbench, current: Refits, white: Whitening, seen: Mapping[str, Float[np.ndarray, " time"]]
+    bench: Workbench,
+    current: Refits,
+    white: Whitening,
+    seen: Mapping[str, Float[np.ndarray, " time"]],
+    responses: Float[np.ndarray, "piece record time signal"],
 ) -> float:
     """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
-    tests, r = _examined(bench, current, white, seen)
+    tests, r = _examined(bench, current, white, seen, responses)
     return max((_explained(test.basis.T @ r) for test in tests), default=0.0)
 
 
@@ -126,11 +135,13 @@ def _log_of_chi_square(value: float, freedom: int) -> float:
     return float(np.log(p) if p > 0 else far)
 
 
-def _examined(bench: Workbench, final: Refits, white: Whitening, seen) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
+def _examined(
+    bench: Workbench, final: Refits, white: Whitening, seen, responses
+) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
     """Return the tests of curves that could show at all, and the whitened residual."""
     curves = curves_of_tests(bench, seen)
     known, r = unexplained(final, white)
-    changes = white(curve_responses(bench, final.points[0], curves))
+    changes = white(responses)
     rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
     tests = []
     for curve, part in zip(curves, rows, strict=True):

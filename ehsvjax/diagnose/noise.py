@@ -136,9 +136,12 @@ def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
     flat = responses.reshape(len(responses), -1)
     norms = np.linalg.norm(flat, axis=1)
     flat = flat[norms > 0] / norms[norms > 0, None]
-    values, vectors = np.linalg.svd(flat, full_matrices=False)[1:]
-    kept = vectors[values > _NEGLIGIBLE * values[0]][: flat.shape[1] // 2]
-    return np.moveaxis(kept.reshape(-1, *shape), 0, 2)
+    # There are many more samples than responses: their products are quicker decomposed.
+    squares, combinations = np.linalg.eigh(flat @ flat.T)
+    order = np.argsort(-squares)[: flat.shape[1] // 2]
+    kept = order[squares[order] > _NEGLIGIBLE**2 * squares[-1]]
+    vectors = (combinations[:, kept] / np.sqrt(squares[kept])).T @ flat
+    return np.moveaxis(vectors.reshape(-1, *shape), 0, 2)
 
 
 def _combined(basis, residual):
@@ -168,12 +171,12 @@ def spikes(
         if spread == 0.0:
             continue
         seen = (np.where(measured[..., i], series[..., i], np.nan) for series in (residual, outputs))
-        alone = [_alone(series, _SPIKE * spread) for series in seen]
+        alone = [standing_alone(series, _SPIKE * spread) for series in seen]
         found[..., i] = alone[0] & alone[1] & measured[..., i]
     return found
 
 
-def _alone(series: Float[np.ndarray, "record time"], apart: float) -> Bool[np.ndarray, "record time"]:
+def standing_alone(series: Float[np.ndarray, "record time"], apart: float) -> Bool[np.ndarray, "record time"]:
     """Return samples that lie further than this on one side of all but one of the three before and the three after.
 
     At an end of the record, and beside what is missing, there are fewer.

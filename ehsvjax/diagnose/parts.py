@@ -41,6 +41,6 @@ def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: st
     added = np.zeros((count + 1, *shape[:2], len(bench.places)))
     for k in range(count):
         added[k + 1, :, part == k, bench.places.index(place)] = count * bench.probes[place]
-    outputs = bench.simulated(np.repeat(point[None], count + 1, axis=0), added)
+    outputs = bench.sketched(np.repeat(point[None], count + 1, axis=0), added)
     length = shape[1] / count * float(bench.problem.samples.sample_period[0])
     return Parts(place, part, length, (outputs[1:] - outputs[0]) / (count * bench.probes[place]))

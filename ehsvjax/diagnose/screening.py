@@ -113,12 +113,12 @@ def responses_at(
     """
     bench = with_frequencies(bench, current, white, parts)
     point = current.points[0]
-    here = bench.problem.samples.outputs - current.residual[0]
     trials = [
         trial for i, c in enumerate(bench.candidates) if i not in excluded for trial in _trials(bench, i, c, point)
     ]
-    points = np.concatenate([t.points for t in trials]) if trials else np.zeros((0, len(point)))
-    changes = bench.simulated(points) - here if len(points) else np.zeros((0, *here.shape))
+    points = np.concatenate([np.zeros((0, len(point))), *(t.points for t in trials)])
+    outputs = bench.sketched(np.concatenate([point[None], points]))
+    changes = outputs[1:] - outputs[0]
     changes = np.where(np.isfinite(changes).all(axis=(1, 2, 3), keepdims=True), changes, 0.0)
     return Responses(tuple(trials), changes)
 

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
 from ehsvjax.diagnose.dependence import strongest_dependence
+from ehsvjax.diagnose.jumps import without_jumps
 from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
@@ -24,7 +25,7 @@ from ehsvjax.diagnose.trials import (
     trials_of,
     without,
 )
-from ehsvjax.diagnose.workbench import Workbench, settled
+from ehsvjax.diagnose.workbench import Workbench, prepared, settled
 
 SIGNIFICANT = 0.002
 """Corrected p-value of the whole search below which an effect is taken to be there."""
@@ -73,8 +74,7 @@ class Selection:
     """What the search came to.
 
     Attributes:
-        bench: the workbench, with the samples that were used.
-        seen: what runs along the nominal model and varies, by name.
+        trials: what was tried, with, on their workbench, the samples that were used.
         included: positions of the effects, in the order in which they were found.
         final: the refit with them.
         nominal: the refit without any, under the same noise.
@@ -86,8 +86,7 @@ class Selection:
 
     """
 
-    bench: Workbench
-    seen: dict[str, Float[np.ndarray, " time"]]
+    trials: Trials
     included: tuple[int, ...]
     final: Refits
     nominal: Refits
@@ -96,6 +95,16 @@ class Selection:
     rivals: tuple[tuple[Rival, ...], ...]
     gains: tuple[float, ...]
     integration: Integration
+
+    @property
+    def bench(self) -> Workbench:
+        """The workbench."""
+        return self.trials.bench
+
+    @property
+    def seen(self) -> dict[str, Float[np.ndarray, " time"]]:
+        """What runs along the nominal model and varies, by name."""
+        return self.trials.seen
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
@@ -110,11 +119,11 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         progress: told of each stage.
 
     """
-    begun, bench = bench, settled(bench, bench.nominal[None], bench.problem.noise_variance)
+    begun, bench = bench, prepared(bench)
     progress("simulating every candidate", 0.15)
     trials = trials_of(bench, progress)
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
-    stages = [_look(trials, (), refit_sets(trials, [[bench.nominal]], [()], plain))]
+    stages = [_look(trials, (), refit_sets(trials, [[bench.nominal]], [()], plain), plain)]
     while len(stages[-1].included) < _MOST_EFFECTS:
         found = _next_effect(stages[-1])
         if found is None:
@@ -133,11 +142,10 @@ def select(bench: Workbench, progress: Progress) -> Selection:
             start = without(last.trials.bench, last.current.points[0], needless)
             rest = tuple(j for j in last.included if j != needless)
             last = last._replace(included=rest, current=refit_sets(last.trials, [[start]], [rest], last.white))
-        last = _look(last.trials, last.included, last.current)
+        last = _look(last.trials, last.included, last.current, last.white)
     last = weighed.stage
     return Selection(
-        bench=last.trials.bench,
-        seen=last.trials.seen,
+        trials=last.trials,
         included=last.included,
         final=last.current,
         nominal=weighed.nominal,
@@ -182,7 +190,7 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
             gains, needless = _gains(stage, nominal)
             return _Weighed(stage, nominal, rivals, gains, needless, worth)
         # Nothing is looked for again: what was found is refitted from where it is.
-        stage = _look(trials._replace(bench=known), stage.included, stage.current)
+        stage = _look(trials._replace(bench=known), stage.included, stage.current, white)
         included, final, rivals = rivals_again(stage.trials, stage.included, stage.current, rivals, stage.white)
         stage = stage._replace(included=included, current=final)
 
@@ -230,21 +238,26 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
     return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
 
 
-def _look(trials: Trials, included: tuple[int, ...], current: Refits) -> Stage:
-    """Look at what is left after a refit: its noise, and what could explain the rest."""
+def _look(trials: Trials, included: tuple[int, ...], current: Refits, white: Whitening) -> Stage:
+    """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest."""
+    judged = False
     while True:
         bench = trials.bench
         measured = bench.problem.samples.measured
-        plain = plain_noise(bench.problem.noise_variance, measured)
-        tried = responses_at(bench, current, included, plain, trials.parts)
-        spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
-        white = noise_outside(current.residual[0], measured, spanned)
-        known = settled(bench, current.points, white.variances)
-        if known is bench:
+        known = without_jumps(settled(bench, current.points, white.variances), current, white)
+        if known is not bench:
+            judged = False
+            trials = trials._replace(bench=known)
+            only_known = plain_noise(white.variances, known.problem.samples.measured)
+            current = refit_sets(trials, [[current.points[0]]], [included], only_known)
+        elif judged:
             break
-        trials = trials._replace(bench=known)
-        only_known = plain_noise(white.variances, known.problem.samples.measured)
-        current = refit_sets(trials, [[current.points[0]]], [included], only_known)
+        else:
+            judged = True
+            plain = plain_noise(bench.problem.noise_variance, measured)
+            tried = responses_at(bench, current, included, plain, trials.parts)
+            spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
+            white = noise_outside(current.residual[0], measured, spanned)
     if white.coloured or len(white.noises) > 1:
         current = refit_sets(trials, [[current.points[0]]], [included], white)
         tried = responses_at(bench, current, included, white, trials.parts)
@@ -264,7 +277,7 @@ def _next_effect(stage: Stage) -> Stage | None:
     if not hopeful:
         return None
     best: Stage | None = None
-    without_form = strongest_dependence(bench, stage.current, stage.white, trials.seen)
+    without_form = strongest_dependence(bench, stage.current, stage.white, trials.seen, trials.curves)
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
         some = hopeful[first : first + REFITTED_TOGETHER]
@@ -283,12 +296,12 @@ def _next_effect(stage: Stage) -> Stage | None:
             continue
         if not _is_gain(stage, refitted.of([chosen]), candidate):
             continue
-        best = _look(trials, (*stage.included, candidate), refitted.of([chosen]))
+        best = _look(trials, (*stage.included, candidate), refitted.of([chosen]), stage.white)
         if not _leaves_something(best):
             break
         reshaped = refit_reshaped(best.trials, best.current, best.included, candidate, best.white)
         if reshaped is not best.current:
-            best = _look(best.trials, best.included, reshaped)
+            best = _look(best.trials, best.included, reshaped, best.white)
             if not _leaves_something(best):
                 break
     return best

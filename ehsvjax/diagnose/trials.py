@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.curves import curve_responses, curves_of_tests, quantities
+from ehsvjax.diagnose.curves import quantities, responses_of_tests
 from ehsvjax.diagnose.frequencies import parts_of
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts
@@ -52,8 +52,7 @@ class Trials(NamedTuple):
 def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and parts of harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    curves = curve_responses(bench, bench.nominal, curves_of_tests(bench, seen))
-    return Trials(bench, seen, curves, parts_of(bench), {}, progress)
+    return Trials(bench, seen, responses_of_tests(bench, bench.nominal, seen), parts_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:

@@ -57,6 +57,7 @@ class Workbench:
         column: name of an unknown -> its column; initial conditions are `name[record]`.
         nominal: `[parameter]` the point at which every effect is absent.
         differences: `[parameter]` of coordinates, for derivatives.
+        sketched_at: integration steps per sample that know most readings: enough to see where a cause points.
 
     """
 
@@ -72,6 +73,7 @@ class Workbench:
     column: dict[str, int]
     nominal: Float[np.ndarray, " parameter"]
     differences: Float[np.ndarray, " parameter"]
+    sketched_at: int
 
     @property
     def base_columns(self) -> list[int]:
@@ -121,6 +123,14 @@ class Workbench:
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             return np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
+
+    def sketched(
+        self,
+        points: Float[np.ndarray, "individual parameter"],
+        disturbances: Float[np.ndarray, "individual record time place"] | None = None,
+    ) -> Float[np.ndarray, "individual record time signal"]:
+        """Return the outputs as `simulated` does, for what is compared with one another only, not with readings."""
+        return self.simulated(points, disturbances, self.sketched_at)
 
     def linearised(
         self, points: Float[np.ndarray, "individual parameter"], chosen: Int[np.ndarray, "individual direction"]
@@ -228,13 +238,23 @@ def _bench(fit: Fit, record: Record, bank: Sequence[Effect], probes: Mapping[str
             one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
             nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
     nothing = np.zeros((1, len(record), len(places)))
-    return Workbench(fit, full, problem, found, scales, internal, places, probes, nothing, column, nominal, differences)
+    return Workbench(fit, full, problem, found, scales, internal, places, probes, nothing, column, nominal, differences,
+                     int(problem.substeps))  # fmt: skip
 
 
 def _probe(values: Float[np.ndarray, " time"]) -> float:
     """Return a small part of what runs along a signal, or a small number where nothing does."""
     largest = float(np.max(np.abs(values)))
     return _PROBE * largest if 0.0 < largest < np.inf else _PROBE
+
+
+def prepared(bench: Workbench) -> Workbench:
+    """Return the bench at the step that the nominal model needs, and at the one at which its trials are sketched."""
+    noise_variance, nominal = bench.problem.noise_variance, bench.nominal[None]
+    rough = arithmetic.arithmetic(
+        bench.problem, lambda substeps: bench.simulated(nominal, substeps=substeps), noise_variance, arithmetic.ROUGHLY
+    )
+    return replace(settled(bench, nominal, noise_variance), sketched_at=rough.substeps)
 
 
 def settled(

@@ -80,8 +80,6 @@ def meat(
 ) -> Float[np.ndarray, "parameter parameter"]:
     """Return J^T Sigma J over the records, for one output; rows of J without a sample are zero."""
     flat = jacobian.reshape(-1, jacobian.shape[-1])
-    if not len(noise.coefficients):
-        return noise.variance * flat.T @ flat
     return flat.T @ _correlated(jacobian, noise).reshape(flat.shape)
 
 
@@ -89,6 +87,8 @@ def _correlated(
     jacobian: Float[np.ndarray, "record time parameter"], noise: ResidualNoise
 ) -> Float[np.ndarray, "record time parameter"]:
     """Return Sigma J. A Toeplitz matrix is a convolution: twice the length, so that it does not wrap round."""
+    if not len(noise.coefficients):
+        return noise.variance * jacobian
     from scipy.fft import irfft, next_fast_len, rfft
 
     length = jacobian.shape[1]

@@ -1,0 +1,56 @@
+"""Readings beside a jump of an output, which no unknown is known well enough to place before or behind it.
+
+A load pressure jumps as the spool leaves its dead zone. Where a reading lies within what the unknowns' own errors make
+of that moment, the sum of squares has a step, a refit ends where it happens to stand, and a cause that moves the jump
+by a microsecond seems to be there. Such a reading is not straight within the errors, and its neighbours are: it carries
+no weight. A smooth bend has neighbours that bend as well.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ehsvjax.arithmetic import LEFT_OUT, few
+from ehsvjax.diagnose.noise import Whitening, standing_alone
+from ehsvjax.diagnose.refits import Refits, bounds_of
+from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
+
+# Deviations of the noise by which a reading may bend over the unknowns' standard errors, more than its neighbours.
+_STRAIGHT = 0.3
+
+
+def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbench:
+    """Return the bench without readings that jump within the errors of a refit; itself if there is none.
+
+    Args:
+        bench: the trials' workbench.
+        current: one refit.
+        white: of its noise.
+
+    """
+    samples = bench.problem.samples
+    point, columns = current.points[0], current.chosen[0][current.chosen[0] >= 0]
+    jacobian = white(current.slopes[0][: len(columns)])
+    norms = np.linalg.norm(jacobian, axis=1)
+    seen = norms > 0
+    if not seen.any():
+        return bench
+    vectors, values, _ = np.linalg.svd(jacobian[seen] / norms[seen, None], full_matrices=False)
+    kept = values > TOLD_APART * values[0]
+    # Of each principal direction one standard error.
+    errors = vectors[:, kept] / values[kept] / norms[seen, None]
+    steps = np.zeros((errors.shape[1], len(point)))
+    steps[:, columns[seen]] = errors.T
+    lower, upper = bounds_of(bench)
+    points = np.clip(np.concatenate([point + steps, point - steps]), lower, upper)
+    outputs = bench.simulated(np.concatenate([point[None], points]))
+    forward, backward = outputs[1 : len(steps) + 1], outputs[len(steps) + 1 :]
+    bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0)
+    apart = _STRAIGHT * np.sqrt(white.variances)
+    alone = [standing_alone(bent[..., i], limit) for i, limit in enumerate(apart)]
+    jumping = samples.measured & np.stack(alone, axis=-1)
+    # More than that no jump bends.
+    if not jumping.any() or not few(jumping, samples.measured, LEFT_OUT):
+        return bench
+    straight = samples._replace(measured=samples.measured & ~jumping)
+    return replace(bench, problem=replace(bench.problem, samples=straight))
