@@ -92,7 +92,9 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     With one output and squared residuals its weight does not move the minimum. The number returned says how many starts
     came to the same minimum.
     """
-    every = problem.samples
+    # A longer step may not know what a shorter one does, so that all readings are asked again. At one and the same step
+    # what was left out stays out, lest readings come and go.
+    asked = problem.samples
     problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
     with jax.enable_x64(True):
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
@@ -105,15 +107,20 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
             before = problem
             if reweigh:
                 problem = replace(problem, noise_variance=_residual_variance(problem, refined.residuals[best]))
-            # Of all readings: what a longer step did not know, or elsewhere, may be known here.
-            known = settled_at(replace(problem, samples=every), np.asarray(refined.individual[best]))
+            known = settled_at(replace(problem, samples=asked), np.asarray(refined.individual[best]))
+            starts = np.asarray(refined.individual)
+            if known.substeps == before.substeps:
+                asked = known.samples
+                # Their weights alone are others: the best of the starts goes on.
+                starts = np.broadcast_to(starts[best], starts.shape)
             same = known.substeps == before.substeps and np.array_equal(known.samples.measured, before.samples.measured)
             if same and (not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
                 break
             problem = known
             # From where each start has led: what kept them apart may have been the arithmetic.
-            refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(refined.individual), held=nothing))
-            agreeing = _agreeing(problem, refined)
+            refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts), held=nothing))
+            if known.substeps != before.substeps:
+                agreeing = _agreeing(problem, refined)
         return refined, agreeing, problem
 
 
