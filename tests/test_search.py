@@ -143,6 +143,9 @@ def test_sizes_are_refused_before_anything_is_traced(monkeypatch):
 
 
 INTERRUPTED = """
+import signal
+# A shell's background jobs ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 import jax, numpy as np, ehsvjax
 from ehsvjax import search
 gather = search._since

@@ -39,12 +39,12 @@ def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbe
     kept = values > TOLD_APART * values[0]
     # Of each principal direction one standard error.
     errors = vectors[:, kept] / values[kept] / norms[seen, None]
-    steps = np.zeros((errors.shape[1], len(point)))
-    steps[:, columns[seen]] = errors.T
+    moved = columns[seen]
     lower, upper = bounds_of(bench)
-    points = np.clip(np.concatenate([point + steps, point - steps]), lower, upper)
-    outputs = bench.simulated(np.concatenate([point[None], points]))
-    forward, backward = outputs[1 : len(steps) + 1], outputs[len(steps) + 1 :]
+    points = np.repeat(point[None], 1 + 2 * errors.shape[1], axis=0)
+    points[1:, moved] = np.clip(point[moved] + np.concatenate([errors.T, -errors.T]), lower[moved], upper[moved])
+    outputs = bench.simulated(points)
+    forward, backward = np.split(outputs[1:], 2)
     bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0)
     apart = _STRAIGHT * np.sqrt(white.variances)
     alone = [standing_alone(bent[..., i], limit) for i, limit in enumerate(apart)]
