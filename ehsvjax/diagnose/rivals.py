@@ -11,9 +11,13 @@ from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.trials import REFITTED_TOGETHER, Trials, fits, refit_screened, refit_sets, without
+from ehsvjax.diagnose.workbench import Workbench
 
 PER_NUMBER = 4.0
 """Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
+# Noise variances by which anything else must do better than a constant of the model that was given wrong, the
+# commonest cause of all, to come before it.
+_RARER = 1.0
 _SWAPS = 3
 # Noise variances by which a refit has to be better than another to take its place.
 _LOWER = 0.1
@@ -24,6 +28,12 @@ _FAR = 5.0
 # Where a misfit is left: share of a cause's gain that a rival may lack, parts of the record that are compared, and
 # deviations between them.
 _LACKS, _PARTS, _SURELY = 0.1, 20, 3.0
+
+
+def price(bench: Workbench, candidate: int) -> float:
+    """Return the noise variances that a candidate must bring beyond another to come before it."""
+    rarer = 0.0 if bench.candidates[candidate].effect.kind == "constant" else _RARER
+    return PER_NUMBER * bench.numbers_of(candidate) + rarer
 
 
 class Rival(NamedTuple):
@@ -124,7 +134,7 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
 def _ranked(trials: Trials, own: int, found: Mapping[int, Refits]) -> tuple[Rival, ...]:
     """Return what was refitted in the place of an effect, the best first, with how much worse each is."""
     rivals = [
-        Rival(candidate, _cost(refitted) + PER_NUMBER * trials.bench.numbers_of(candidate), refitted)
+        Rival(candidate, _cost(refitted) + price(trials.bench, candidate), refitted)
         for candidate, refitted in found.items()
         if np.isfinite(_cost(refitted))
     ]

@@ -13,7 +13,7 @@ from ehsvjax.diagnose.jumps import without_jumps
 from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
 from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
-from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, rivals_again, rivals_of_all
+from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, price, rivals_again, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
 from ehsvjax.diagnose.trials import (
     REFITTED_TOGETHER,
@@ -285,7 +285,7 @@ def _next_effect(stage: Stage) -> Stage | None:
         more = ", ..." if len(some) > 3 else ""
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)
-        penalised = refitted.cost + [PER_NUMBER * bench.numbers_of(s.candidate) for s in some]
+        penalised = refitted.cost + [price(bench, s.candidate) for s in some]
         chosen = int(np.argmin(np.where(np.isnan(penalised), np.inf, penalised)))
         if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.white):
             break
