@@ -23,8 +23,6 @@ _SWAPS = 3
 _LOWER = 0.1
 # Deficit to first order of a rival that is refitted, however many there are; a large effect is not of first order.
 _WORTH_A_REFIT = 100.0
-# Deviations of the noise (root mean square) that a refit without an effect is off, beyond which it is too far off.
-_FAR = 5.0
 # Where a misfit is left: share of a cause's gain that a rival may lack, parts of the record that are compared, and
 # deviations between them.
 _LACKS, _PARTS, _SURELY = 0.1, 20, 3.0
@@ -78,22 +76,20 @@ def rivals_of_all(
     trials: Trials, included: tuple[int, ...], final: Refits, white: Whitening
 ) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
     """Return the effects after swaps for better rivals, their refit, and for each all that could be there instead."""
-    groups: list[tuple[Rival, ...]] = []
-    for attempt in range(_SWAPS + 1):
-        groups, better = [], None
-        for i in included:
-            rest = tuple(j for j in included if j != i)
-            group = _rivals_of(trials, i, rest, final, white)
-            groups.append(group)
-            first = group[0]
-            lower = float(first.refitted.cost[0]) < float(final.cost[0]) - _LOWER
-            if (first.candidate != i or lower) and attempt < _SWAPS:
-                better = (tuple(first.candidate if j == i else j for j in included), first.refitted)
-                break
-        if better is None:
-            break
-        included, final = better
-    return included, final, tuple(groups)
+    groups: dict[int, tuple[Rival, ...]] = {}
+    swaps, waiting = 0, list(included)
+    while waiting:
+        own = waiting.pop(0)
+        group = _rivals_of(trials, own, tuple(j for j in included if j != own), final, white)
+        best = group[0]
+        if swaps < _SWAPS and (best.candidate != own or _cost(best.refitted) < _cost(final) - _LOWER):
+            # The others are looked at anew, beside what is better.
+            swaps += 1
+            included, final = tuple(best.candidate if j == own else j for j in included), best.refitted
+            waiting = [j for j in included if j != best.candidate]
+            own = best.candidate
+        groups[own] = group
+    return included, final, tuple(groups[i] for i in included)
 
 
 def rivals_again(
@@ -120,14 +116,8 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     bench = trials.bench
     start = without(bench, final.points[0], own)
     current = refit_sets(trials, [[start]], [rest], white)
-    far = bool(current.cost[0] > _FAR**2 * white.used.sum())
-    base = _beside(trials, start, current, white) if rest and not far else current
+    base = _beside(trials, start, current, white) if rest else current
     found = _refitted_from(trials, base, own, rest, white)
-    if far:
-        # Refits from far off end in local minima, and what is like the effect there need not be like it here.
-        here = refit(bench, start[None], current.chosen, white, iterations=1)
-        for candidate, refitted in _refitted_from(trials, here, own, rest, white, thoroughly=True).items():
-            found[candidate] = min(found.get(candidate, refitted), refitted, key=_cost)
     return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)})
 
 
@@ -165,16 +155,13 @@ def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Ref
 
 
 def _refitted_from(
-    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, thoroughly: bool = False
+    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening
 ) -> dict[int, Refits]:
-    """Return the refits of candidates that are, at a point without the effect, most like it.
-
-    Thoroughly as in `refit_screened`.
-    """
+    """Return the refits of candidates that are, at a point without the effect, most like it."""
     bench = trials.bench
     screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, base, thoroughly=thoroughly)
+    refitted = refit_screened(trials, close, rest, white, base)
     return {s.candidate: refitted.of([k]) for k, s in enumerate(close)}
 
 

@@ -30,7 +30,7 @@ from ehsvjax.diagnose.workbench import Workbench, prepared, settled
 SIGNIFICANT = 0.002
 """Corrected p-value of the whole search below which an effect is taken to be there."""
 _MOST_EFFECTS = 3
-# Rounds of swaps, deletions and new looks, in which the causes settle.
+# Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
 _ROUNDS = 6
 # Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
 _WEIGHED = 25.0
@@ -131,18 +131,15 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         stages.append(found)
     progress("refitting the rivals", 0.5)
     last = stages.pop()
-    for rounds_left in reversed(range(_ROUNDS)):
-        weighed = _weighed(last, stages[0].current if stages else last.current)
-        needless = weighed.needless
-        if not rounds_left or (needless is None and set(weighed.stage.included) == set(last.included)):
-            break
+    nominal = stages[0].current if stages else last.current
+    weighed = _weighed(last, nominal)
+    while weighed.needless is not None:
+        # What was added first can become needless by what was added later.
         last = weighed.stage
-        if needless is not None:
-            # What was added first can become needless by what was added later.
-            start = without(last.trials.bench, last.current.points[0], needless)
-            rest = tuple(j for j in last.included if j != needless)
-            last = last._replace(included=rest, current=refit_sets(last.trials, [[start]], [rest], last.white))
-        last = _look(last.trials, last.included, last.current, last.white)
+        start = without(last.trials.bench, last.current.points[0], weighed.needless)
+        rest = tuple(j for j in last.included if j != weighed.needless)
+        refitted = refit_sets(last.trials, [[start]], [rest], last.white)
+        weighed = _weighed(_look(last.trials, rest, refitted, last.white), nominal)
     last = weighed.stage
     return Selection(
         trials=last.trials,
@@ -180,19 +177,21 @@ class _Weighed(NamedTuple):
 
 def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
+    looked_at = set(stage.included)
     included, final, rivals = rivals_of_all(stage.trials, stage.included, stage.current, stage.white)
-    stage = stage._replace(included=included, current=final)
-    while True:
+    for rounds_left in reversed(range(_ROUNDS)):
+        stage = stage._replace(included=included, current=final)
         trials, white = stage.trials, stage.white
         nominal = refit_sets(trials, [[nominal.points[0]]], [()], white)
-        known, worth = _settled_for_all(trials.bench, _compared(stage.current, nominal, rivals), white)
-        if known is trials.bench:
-            gains, needless = _gains(stage, nominal)
-            return _Weighed(stage, nominal, rivals, gains, needless, worth)
-        # Nothing is looked for again: what was found is refitted from where it is.
-        stage = _look(trials._replace(bench=known), stage.included, stage.current, white)
-        included, final, rivals = rivals_again(stage.trials, stage.included, stage.current, rivals, stage.white)
-        stage = stage._replace(included=included, current=final)
+        known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), white)
+        if not rounds_left or (known is trials.bench and set(included) == looked_at):
+            break
+        # Nothing is searched again: what was found is refitted from where it is, under the noise that is left now.
+        stage = _look(trials._replace(bench=known), included, final, white)
+        looked_at = set(included)
+        included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.white)
+    gains, needless = _gains(stage, nominal)
+    return _Weighed(stage, nominal, rivals, gains, needless, worth)
 
 
 def _settled_for_all(bench: Workbench, points, white: Whitening) -> tuple[Workbench, float]:

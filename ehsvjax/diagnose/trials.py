@@ -97,17 +97,11 @@ def refit_screened(
     rest: Sequence[int],
     white: Whitening,
     current: Refits,
-    thoroughly: bool = False,
 ) -> Refits:
-    """Refit each screened candidate beside the effects that are there already, from a point without it.
-
-    From the start that promises most, or, thoroughly, from every start.
-    """
+    """Refit each screened candidate beside the effects that are there already, from the start that promises most."""
     bench = trials.bench
-    starts = [_starts(bench, s) for s in some]
-    if not thoroughly:
-        starts = [[start] for start in _most_promising(bench, starts, white, current)]
-    return refit_sets(trials, starts, [(*rest, s.candidate) for s in some], white, race=True)
+    starts = _most_promising(bench, [_starts(bench, s) for s in some], white, current)
+    return refit_sets(trials, [[start] for start in starts], [(*rest, s.candidate) for s in some], white, race=True)
 
 
 def refit_reshaped(
