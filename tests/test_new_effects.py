@@ -14,6 +14,8 @@ from ehsvjax.effects.internal import contexts_of
 from tests.plants import held_levels
 from tests.small_models import OUTFLOW, PUMP, carriage, carriage_plant, record_of, tanks, tanks_plant
 
+# One process compiles.
+pytestmark = pytest.mark.xdist_group("diagnoses of a carriage")
 KEY = jax.random.key(0)
 
 

@@ -13,6 +13,8 @@ from ehsvjax.diagnose.progress import bar
 from tests.plants import held_levels
 from tests.small_models import STIFFNESS, carriage, carriage_plant, record_of
 
+# One process compiles.
+pytestmark = pytest.mark.xdist_group("diagnoses of a carriage")
 KEY = jax.random.key(0)
 PERIOD, SAMPLES = 0.02, 1200
 NOISE = {"position": 2e-3, "velocity": 2e-2}

@@ -23,6 +23,8 @@ from tests import hand_made
 from tests.hidden_records import Hidden, records
 
 ROOT = Path(__file__).parents[1]
+# One process compiles for one model.
+of_the_oscillator = pytest.mark.xdist_group("diagnoses of the oscillator")
 TIME = np.arange(40) * 1e-3
 RECORD = Record(TIME, {"command": np.full(40, 3e-3)}, {"position": 0.01 * np.sin(TIME)})
 OWN = Effect(
@@ -255,6 +257,7 @@ def saved(diagnosis, tmp_path_factory):
     return path
 
 
+@of_the_oscillator
 def test_a_diagnosis_prints_and_draws_the_same_in_another_process(diagnosis, saved, tmp_path):
     said = subprocess.run(
         [sys.executable, "-c", PROCESS, str(saved), str(tmp_path / "there.html")],
@@ -271,6 +274,7 @@ def test_a_diagnosis_prints_and_draws_the_same_in_another_process(diagnosis, sav
     assert there == here
 
 
+@of_the_oscillator
 def test_a_loaded_diagnosis_holds_its_parts_once(diagnosis, saved):
     loaded = Diagnosis.load(saved)
     assert loaded.extended.records[0] is loaded.record
@@ -281,6 +285,7 @@ def test_a_loaded_diagnosis_holds_its_parts_once(diagnosis, saved):
     assert loaded.extended.model == diagnosis.extended.model
 
 
+@of_the_oscillator
 def test_the_fit_of_an_extended_model_comes_back(diagnosis, tmp_path):
     assert effects_of(diagnosis.extended.model)
     diagnosis.extended.save(tmp_path / "extended")
@@ -289,6 +294,7 @@ def test_the_fit_of_an_extended_model_comes_back(diagnosis, tmp_path):
     assert loaded.rmse == diagnosis.extended.rmse
 
 
+@of_the_oscillator
 def test_a_fit_is_no_diagnosis_and_a_diagnosis_no_fit(saved, tmp_path):
     hand_made.fit().save(tmp_path / "fit")
     with pytest.raises(ValueError, match=r"cannot be read as a diagnosis .* \(it holds a Fit\)"):

@@ -9,6 +9,8 @@ from ehsvjax.diagnose import diagnose
 from tests.plants import held_levels, servovalve_plant
 from tests.small_models import MASS, STIFFNESS, carriage, carriage_plant, modulated_plant, record_of
 
+# One process compiles for one model.
+of_a_carriage = pytest.mark.xdist_group("diagnoses of a carriage")
 KEY = jax.random.key(0)
 PERIOD, SAMPLES = 0.02, 1200
 NOISE = {"position": 2e-3}
@@ -30,6 +32,7 @@ def softer():
     return diagnosed(carriage(), carriage_plant(PUSH, PERIOD, stiffness=1.5 * STIFFNESS)[:, 0], seed=1)
 
 
+@of_a_carriage
 def test_a_constant_that_is_off_is_in_one_group_with_what_looks_the_same(softer):
     assert suspected(softer) == {"stiffness", "linear_stiffness"}, str(softer)
     # The same as more of a spring at the force: no record tells them apart.
@@ -43,6 +46,7 @@ def test_a_constant_that_is_off_is_in_one_group_with_what_looks_the_same(softer)
     assert error == pytest.approx(0.5, abs=0.01)
 
 
+@of_a_carriage
 def test_what_is_certain_is_no_candidate(softer):
     assert {"stiffness", "modulation"} <= set(softer.table["cause"])
     assert "mass" not in set(softer.table["cause"])
@@ -50,12 +54,14 @@ def test_what_is_certain_is_no_candidate(softer):
     assert not any(cause.startswith("record_duration") for cause in softer.table["cause"])
 
 
+@of_a_carriage
 def test_a_constant_that_is_certain_is_not_blamed_though_it_is_off():
     found = diagnosed(carriage(mass=1.3 * MASS), carriage_plant(PUSH, PERIOD)[:, 0], seed=2)
     assert found.verdict != "adequate"
     assert "mass" not in suspected(found), str(found)
 
 
+@of_a_carriage
 def test_a_constant_of_zero_that_is_there_is_named_with_its_size():
     found = diagnosed(carriage(), modulated_plant(PUSH, PERIOD, 0.5), seed=3)
     assert found.verdict == "named" and found.causes == ("modulation",), str(found)
@@ -63,6 +69,7 @@ def test_a_constant_of_zero_that_is_there_is_named_with_its_size():
     assert found.extended.model.parameter("modulation.value").unit == "1/m"
 
 
+@of_a_carriage
 def test_constants_that_are_right_are_excluded_above_a_size():
     found = diagnosed(carriage(), carriage_plant(PUSH, PERIOD)[:, 0], seed=4)
     assert found.verdict == "adequate", str(found)

@@ -58,7 +58,7 @@ class Integration(NamedTuple):
 
     Attributes:
         step_size: s.
-        left_out: output -> readings that no such step knows, such as those beside a jump: they carry no weight.
+        left_out: output -> readings beside a jump, which no such step knows or no unknown places: they carry no weight.
         worth: noise variances by which halving the step changes the difference of any two explanations' sums of
             squares, at most; of what is more than 25 behind, in twenty-fifths of that.
 

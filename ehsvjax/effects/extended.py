@@ -161,8 +161,10 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
         def step(state, series):
             begin = series(0.0) if places else {}
             added = {place: begin[disturbance(place)] for place in places}
-            current[0] = _Moment(state.time, step_size, state.memories, inside, added)
-            now = drifted(parameters, state.time)
+            # What depends on time is held over the step: at its middle that is right to second order.
+            middle = (state.steps + 0.5) * step_size
+            current[0] = _Moment(middle, step_size, state.memories, inside, added)
+            now = drifted(parameters, middle)
             once = base.stepper(now, step_size, disturbed) if steady is None else steady
             following = once(state.state, series)
             time = (state.steps + 1) * step_size
