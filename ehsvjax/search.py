@@ -16,6 +16,7 @@ from jaxtyping import Array, Key
 
 from ehsvjax import genetic
 from ehsvjax import islands as archipelago
+from ehsvjax.bars import bars
 from ehsvjax.checks import fits_memory, whole
 from ehsvjax.fingerprint import fingerprint
 from ehsvjax.genetic import History, Operators, State, check_operators
@@ -181,9 +182,7 @@ def check_sizes(population: int, generations: int, operators: Operators, islands
 
 
 def _bar(generations: int, done: int):
-    from tqdm.auto import tqdm
-
-    return tqdm(total=generations, initial=done, desc="generations", unit="gen")
+    return bars()(total=generations, initial=done, desc="generations", unit="gen")
 
 
 def _fingerprint(cost: Callable, operators: Operators, state: State, generations: int, tolerance: float) -> str:

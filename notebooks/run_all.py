@@ -24,6 +24,9 @@ def run(path: Path) -> None:
     if "--save" in sys.argv:
         for cell in notebook.cells:
             cell.metadata.pop("execution", None)
+            # Bars and warnings are of the run, not of the notebook.
+            if cell.cell_type == "code":
+                cell.outputs = [output for output in cell.outputs if output.get("name") != "stderr"]
         nbformat.write(notebook, path)
 
 

@@ -4,6 +4,8 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
+from ehsvjax.bars import bars
+
 Progress = Callable[[str, float], None]
 """Told of a stage, and of the share of a diagnosis that is done when it begins."""
 
@@ -14,11 +16,9 @@ def bar(shown: bool | None) -> Iterator[Progress]:
 
     It goes when the diagnosis is done.
     """
-    from tqdm.auto import tqdm
-
     hidden = not _looked_at() if shown is None else not shown
     layout = "{desc} |{bar}| {percentage:.0f}% [{elapsed}<{remaining}]"
-    with tqdm(total=1.0, desc="diagnose", bar_format=layout, leave=False, disable=hidden) as shown_bar:
+    with bars()(total=1.0, desc="diagnose", bar_format=layout, leave=False, disable=hidden) as shown_bar:
 
         def say(stage: str, done: float) -> None:
             shown_bar.set_description(f"diagnose: {stage}", refresh=False)
