@@ -283,7 +283,7 @@ def _next_effect(stage: Stage) -> Stage | None:
         names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
         more = ", ..." if len(some) > 3 else ""
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
-        refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)
+        refitted = refit_screened(trials, some, stage.included, stage.white, stage.current, [stage.current.points[0]])
         penalised = refitted.cost + [price(bench, s.candidate) for s in some]
         chosen = int(np.argmin(np.where(np.isnan(penalised), np.inf, penalised)))
         if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.white):

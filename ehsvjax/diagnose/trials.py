@@ -97,11 +97,17 @@ def refit_screened(
     rest: Sequence[int],
     white: Whitening,
     current: Refits,
+    without_it: Sequence[Float[np.ndarray, " parameter"]],
 ) -> Refits:
-    """Refit each screened candidate beside the effects that are there already, from the start that promises most."""
+    """Refit each screened candidate beside the effects that are there already, from a point without it.
+
+    From the start that promises most, and from points at which it is absent.
+    """
     bench = trials.bench
     starts = _most_promising(bench, [_starts(bench, s) for s in some], white, current)
-    return refit_sets(trials, [[start] for start in starts], [(*rest, s.candidate) for s in some], white, race=True)
+    grown = _grown(bench, some, without_it, white)
+    every = [[start, *points] for start, points in zip(starts, grown, strict=True)]
+    return refit_sets(trials, every, [(*rest, s.candidate) for s in some], white, race=True)
 
 
 def refit_reshaped(
@@ -164,6 +170,33 @@ def _most_promising(
     cost = np.where(np.isfinite(cost), cost, np.inf)
     edges = np.cumsum([0, *(len(choice) for choice in choices)])
     return np.stack([points[a + np.argmin(cost[a:b])] for a, b in itertools.pairwise(edges)])
+
+
+def _grown(
+    bench: Workbench, some: Sequence[Screened], points: Sequence[Float[np.ndarray, " parameter"]], white: Whitening
+) -> list[list[Float[np.ndarray, " parameter"]]]:
+    """Return for each candidate where its own numbers lead from points with nothing of it, all else as it is there.
+
+    Refitted at once, all other unknowns would run far to make up for what it does. None of a limit: no derivative
+    brings it near.
+    """
+    starts, columns, of = [], [], []
+    for k, screened in enumerate(some):
+        candidate = bench.candidates[screened.candidate]
+        numbers = {bench.column[candidate.parameter(n.name)]: n.absent for n in candidate.effect.parameters}
+        if UNLIMITED in numbers.values():
+            continue
+        for point in points:
+            start = point.copy()
+            for j, absent in numbers.items():
+                start[j] = screened.start[j] if absent is None else bench.nominal[j]
+            starts.append(start)
+            columns.append(list(numbers))
+            of.append(k)
+    if not starts:
+        return [[] for _ in some]
+    led = refit(bench, np.stack(starts), padded(columns, max(map(len, columns))), white, race=False).points
+    return [[point for point, i in zip(led, of, strict=True) if i == k] for k in range(len(some))]
 
 
 def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " parameter"]]:
