@@ -8,6 +8,7 @@ halved. What is left in doubt is worth so little that no comparison of two expla
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import jax
@@ -113,13 +114,7 @@ def arithmetic(
     readings, measured, here = problem.samples.outputs, problem.samples.measured, int(problem.substeps)
     spread = np.array([np.var(readings[..., i][measured[..., i]]) for i in range(readings.shape[-1])])
     variance = np.maximum(noise_variance, _LEAST_NOISE**2 * spread)
-    found: dict[int, np.ndarray] = {}
-
-    def at(steps: int) -> Float[np.ndarray, "individual record time signal"]:
-        if steps not in found:
-            found[steps] = outputs_at(steps)
-        return found[steps]
-
+    at = cache(outputs_at)
     while True:
         # Comparisons of a failed simulation with anything are NaN: nothing is known there.
         with np.errstate(invalid="ignore", over="ignore"):
@@ -129,7 +124,8 @@ def arithmetic(
         below = np.cumsum(squares[order])
         kept = int(np.searchsorted(below, _WORTH, side="right"))
         known = measured.copy()
-        known[measured] = np.isin(np.arange(len(order)), order[:kept])
+        known[measured] = False
+        known.flat[np.flatnonzero(measured)[order[:kept]]] = True
         if few(measured & ~known, measured, left_out):
             break
         if finest(replace(problem, substeps=here)):

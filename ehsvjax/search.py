@@ -16,7 +16,7 @@ from jaxtyping import Array, Key
 
 from ehsvjax import genetic
 from ehsvjax import islands as archipelago
-from ehsvjax.bars import bars
+from ehsvjax.bars import progress_bar
 from ehsvjax.checks import fits_memory, whole
 from ehsvjax.fingerprint import fingerprint
 from ehsvjax.genetic import History, Operators, State, check_operators
@@ -182,7 +182,7 @@ def check_sizes(population: int, generations: int, operators: Operators, islands
 
 
 def _bar(generations: int, done: int):
-    return bars()(total=generations, initial=done, desc="generations", unit="gen")
+    return progress_bar(total=generations, initial=done, desc="generations", unit="gen")
 
 
 def _fingerprint(cost: Callable, operators: Operators, state: State, generations: int, tolerance: float) -> str:

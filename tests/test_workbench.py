@@ -121,6 +121,6 @@ def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
         Screened(i, 5.0, 1e-6, 1e-4, p, np.zeros(SAMPLES), (), False, 0.0)
         for i, p in ((limit, start), (rival, without.points[0]))
     ]
-    found = refit_screened(trials, some, (), white, without, [without.points[0]])
+    found = refit_screened(trials, some, (), white, without)
     assert found.points[0, column] * unit == pytest.approx(0.7, rel=0.02)
     assert found.cost[0] < 1.2 * SAMPLES < found.cost[1] < without.cost[0]

@@ -53,6 +53,13 @@ class Curve(NamedTuple):
     periods: Float[np.ndarray, " wave"]
 
 
+class Terms(NamedTuple):
+    """Curves, and what each of their pieces, one curve after the other, does to the outputs of a point."""
+
+    curves: list[Curve]
+    responses: Float[np.ndarray, "piece record time signal"]
+
+
 def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
     """Return what runs along the nominal model and varies, each once: the inputs, outputs, signals, their contexts."""
     record_time = np.arange(bench.problem.samples.inputs.shape[1]) * float(bench.problem.samples.sample_period[0])
@@ -75,8 +82,15 @@ def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
     return kept
 
 
-def curves_of_tests(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " time"]]) -> list[Curve]:
-    """Return the curves of all tests."""
+def terms_at(
+    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, " time"]]
+) -> Terms:
+    """Return the terms of all tests, along all quantities at all places, at a point."""
+    curves = _curves(bench, seen)
+    return Terms(curves, curve_responses(bench, point, curves))
+
+
+def _curves(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " time"]]) -> list[Curve]:
     places = (*bench.places, *bench.problem.observed)
     coarse = [straight_along(bench, place, quantity, seen, _COARSE) for place in places for quantity in seen]
     waves = min(_WAVES, bench.problem.samples.outputs.shape[1] // _SAMPLES_PER_WAVE)
@@ -84,13 +98,6 @@ def curves_of_tests(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " tim
         return coarse
     outputs = [name for name in bench.problem.observed if name in seen]
     return coarse + [_waves_along(bench, place, name, seen[name], waves) for place in bench.places for name in outputs]
-
-
-def responses_of_tests(
-    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, " time"]]
-) -> Float[np.ndarray, "piece record time signal"]:
-    """Return what the pieces of all tests' curves do to the outputs of a point."""
-    return curve_responses(bench, point, curves_of_tests(bench, seen))
 
 
 def straight_along(

@@ -3,17 +3,15 @@
 Noise does not know what runs along the model. So only what depends on it is misfit, however white or coloured.
 """
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.curves import Curve, curves_of_tests, single_waves, waves_in
+from ehsvjax.diagnose.curves import Curve, Terms, single_waves, waves_in
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
-from ehsvjax.diagnose.workbench import Workbench
 
 
 class Dependence(NamedTuple):
@@ -39,24 +37,16 @@ class Dependence(NamedTuple):
     period: float | None
 
 
-def dependences(
-    bench: Workbench,
-    final: Refits,
-    white: Whitening,
-    seen: Mapping[str, Float[np.ndarray, " time"]],
-    responses: Float[np.ndarray, "piece record time signal"],
-) -> tuple[Dependence, ...]:
+def dependences(final: Refits, white: Whitening, terms: Terms) -> tuple[Dependence, ...]:
     """Test whether a residual still depends on anything, the most significant first.
 
     Args:
-        bench: the trials' workbench.
         final: the refit whose residual is judged.
         white: of its noise.
-        seen: the quantities.
-        responses: of the tests' curves (`responses_of_tests`), there or near.
+        terms: that it could depend on, and what they do there or near.
 
     """
-    tests, r = _examined(bench, final, white, seen, responses)
+    tests, r = _examined(final, white, terms)
     components = [(test.basis.T @ r)[None] for test in tests]
     p_values = [float(test.p_value(c)[0]) for test, c in zip(tests, components, strict=True)]
     null = smallest_p_values([test.basis for test in tests], [test.p_value for test in tests], seed=1)
@@ -70,15 +60,9 @@ def dependences(
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
 
 
-def strongest_dependence(
-    bench: Workbench,
-    current: Refits,
-    white: Whitening,
-    seen: Mapping[str, Float[np.ndarray, " time"]],
-    responses: Float[np.ndarray, "piece record time signal"],
-) -> float:
+def strongest_dependence(current: Refits, white: Whitening, terms: Terms) -> float:
     """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
-    tests, r = _examined(bench, current, white, seen, responses)
+    tests, r = _examined(current, white, terms)
     return max((_explained(test.basis.T @ r) for test in tests), default=0.0)
 
 
@@ -135,16 +119,13 @@ def _log_of_chi_square(value: float, freedom: int) -> float:
     return float(np.log(p) if p > 0 else far)
 
 
-def _examined(
-    bench: Workbench, final: Refits, white: Whitening, seen, responses
-) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
+def _examined(final: Refits, white: Whitening, terms: Terms) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
     """Return the tests of curves that could show at all, and the whitened residual."""
-    curves = curves_of_tests(bench, seen)
     known, r = unexplained(final, white)
-    changes = white(responses)
-    rows = np.split(changes, np.cumsum([len(c.pieces) for c in curves])[:-1])
+    changes = white(terms.responses)
+    rows = np.split(changes, np.cumsum([len(c.pieces) for c in terms.curves])[:-1])
     tests = []
-    for curve, part in zip(curves, rows, strict=True):
+    for curve, part in zip(terms.curves, rows, strict=True):
         outside = part - (part @ known) @ known.T
         basis = _basis(outside, np.linalg.norm(part, axis=1))
         if basis.shape[1]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.diagnose.curves import responses_of_tests
+from ehsvjax.diagnose.curves import Terms, terms_at
 from ehsvjax.diagnose.dependence import Dependence, dependences
 from ehsvjax.diagnose.missing import MissingTerm, likelihood, missing_term
 from ehsvjax.diagnose.noise import Whitening, noise_outside
@@ -46,13 +46,13 @@ class Examination(NamedTuple):
 def examine(selection: Selection) -> Examination:
     """Test what a selection leaves, and whether something else explains the record better."""
     bench = selection.bench
-    white, seen, curves = selection.white, selection.seen, selection.trials.curves
-    before = dependences(bench, selection.nominal, white, seen, curves)
+    white, terms = selection.white, selection.trials.terms
+    before = dependences(selection.nominal, white, terms)
     after = before
     if selection.included:
-        curves = responses_of_tests(bench, selection.final.points[0], seen)
-        after = dependences(bench, selection.final, white, seen, curves)
-    innocent = not _depends(selection, after, curves)
+        terms = terms_at(bench, selection.final.points[0], selection.seen)
+        after = dependences(selection.final, white, terms)
+    innocent = not _depends(selection, after, terms)
     chance, or_chance = _random_force(selection, before, innocent)
     if chance is not None:
         selection, after, innocent = selection.without_causes(), before, True
@@ -77,7 +77,7 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
     return (*tests[:_SUSPECTS], *at_home)
 
 
-def _depends(selection: Selection, tests: tuple[Dependence, ...], curves) -> bool:
+def _depends(selection: Selection, tests: tuple[Dependence, ...], terms: Terms) -> bool:
     """Whether what is left depends on something, also if it is itself taken for coloured noise."""
     # Where nothing that a term could do would show, nothing can be told from noise.
     if not tests or tests[0].corrected >= SIGNIFICANT:
@@ -85,7 +85,7 @@ def _depends(selection: Selection, tests: tuple[Dependence, ...], curves) -> boo
     own = _own_noise(selection)
     if not own.coloured:
         return True
-    again = dependences(selection.bench, selection.final, own, selection.seen, curves)
+    again = dependences(selection.final, own, terms)
     return bool(again) and again[0].corrected < SIGNIFICANT
 
 

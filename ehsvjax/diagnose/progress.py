@@ -4,7 +4,7 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
-from ehsvjax.bars import bars
+from ehsvjax.bars import progress_bar
 
 Progress = Callable[[str, float], None]
 """Told of a stage, and of the share of a diagnosis that is done when it begins."""
@@ -18,7 +18,7 @@ def bar(shown: bool | None) -> Iterator[Progress]:
     """
     hidden = not _looked_at() if shown is None else not shown
     layout = "{desc} |{bar}| {percentage:.0f}% [{elapsed}<{remaining}]"
-    with bars()(total=1.0, desc="diagnose", bar_format=layout, leave=False, disable=hidden) as shown_bar:
+    with progress_bar(total=1.0, desc="diagnose", bar_format=layout, leave=False, disable=hidden) as shown_bar:
 
         def say(stage: str, done: float) -> None:
             shown_bar.set_description(f"diagnose: {stage}", refresh=False)

@@ -118,7 +118,7 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     current = refit_sets(trials, [[start]], [rest], white)
     base = _beside(trials, start, current, white) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
-    found = _refitted_from(trials, base, own, rest, white, [base.points[0], start])
+    found = _refitted_from(trials, base, own, rest, white, start)
     return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)})
 
 
@@ -156,13 +156,16 @@ def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Ref
 
 
 def _refitted_from(
-    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, without_it: Sequence[np.ndarray]
+    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, with_it: np.ndarray
 ) -> dict[int, Refits]:
-    """Return the refits of candidates that are, at a point without the effect, most like it."""
+    """Return the refits of candidates that are, at a point without the effect, most like it.
+
+    Also from where all else is as it is with it.
+    """
     bench = trials.bench
     screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, base, without_it)
+    refitted = refit_screened(trials, close, rest, white, base, [with_it])
     return {s.candidate: refitted.of([k]) for k, s in enumerate(close)}
 
 

@@ -199,10 +199,11 @@ def _settled_for_all(bench: Workbench, points, white: Whitening) -> tuple[Workbe
 
     The first is the best. Where another is far behind, its arithmetic counts as a part of that.
     """
-    known = settled(bench, points, white.variances)
+    outputs_at = bench.stepped(points)
+    known = settled(bench, outputs_at, white.variances)
     here = int(known.problem.substeps)
     coarse, fine = (
-        np.sum(white(known.problem.samples.outputs - known.simulated(points, substeps=substeps)) ** 2, axis=-1)
+        np.sum(white(known.problem.samples.outputs - outputs_at(substeps)) ** 2, axis=-1)
         for substeps in (here, 2 * here)
     )
     behind = np.maximum(1.0, (fine - fine[0]) / _WEIGHED)
@@ -239,24 +240,19 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
 
 def _look(trials: Trials, included: tuple[int, ...], current: Refits, white: Whitening) -> Stage:
     """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest."""
-    judged = False
+    trials, current = _known(trials, included, current, white)
     while True:
         bench = trials.bench
         measured = bench.problem.samples.measured
-        known = without_jumps(settled(bench, current.points, white.variances), current, white)
-        if known is not bench:
-            judged = False
-            trials = trials._replace(bench=known)
-            only_known = plain_noise(white.variances, known.problem.samples.measured)
-            current = refit_sets(trials, [[current.points[0]]], [included], only_known)
-        elif judged:
+        tried = responses_at(
+            bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.parts
+        )
+        spanned = np.concatenate([current.slopes[0], tried.changes, trials.terms.responses])
+        white = noise_outside(current.residual[0], measured, spanned)
+        before = trials
+        trials, current = _known(before, included, current, white)
+        if trials is before:
             break
-        else:
-            judged = True
-            plain = plain_noise(bench.problem.noise_variance, measured)
-            tried = responses_at(bench, current, included, plain, trials.parts)
-            spanned = np.concatenate([current.slopes[0], tried.changes, trials.curves])
-            white = noise_outside(current.residual[0], measured, spanned)
     if white.coloured or len(white.noises) > 1:
         current = refit_sets(trials, [[current.points[0]]], [included], white)
         tried = responses_at(bench, current, included, white, trials.parts)
@@ -264,6 +260,18 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, white: Whi
         # The variance of one output's white noise does not move the best fit.
         current = current._replace(cost=np.array([_cost_under(current, white)]))
     return Stage(trials, included, current, white, screen(bench, current, tried, white, int(measured.sum()) // 2))
+
+
+def _known(trials: Trials, included: tuple[int, ...], current: Refits, white: Whitening) -> tuple[Trials, Refits]:
+    """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
+    while True:
+        bench = trials.bench
+        known = without_jumps(settled(bench, bench.stepped(current.points), white.variances), current, white)
+        if known is bench:
+            return trials, current
+        trials = trials._replace(bench=known)
+        only_known = plain_noise(white.variances, known.problem.samples.measured)
+        current = refit_sets(trials, [[current.points[0]]], [included], only_known)
 
 
 def _next_effect(stage: Stage) -> Stage | None:
@@ -276,14 +284,14 @@ def _next_effect(stage: Stage) -> Stage | None:
     if not hopeful:
         return None
     best: Stage | None = None
-    without_form = strongest_dependence(bench, stage.current, stage.white, trials.seen, trials.curves)
+    without_form = strongest_dependence(stage.current, stage.white, trials.terms)
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
         some = hopeful[first : first + REFITTED_TOGETHER]
         names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
         more = ", ..." if len(some) > 3 else ""
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
-        refitted = refit_screened(trials, some, stage.included, stage.white, stage.current, [stage.current.points[0]])
+        refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)
         penalised = refitted.cost + [price(bench, s.candidate) for s in some]
         chosen = int(np.argmin(np.where(np.isnan(penalised), np.inf, penalised)))
         if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.white):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.curves import quantities, responses_of_tests
+from ehsvjax.diagnose.curves import Terms, quantities, terms_at
 from ehsvjax.diagnose.frequencies import parts_of
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts
@@ -34,7 +34,7 @@ class Trials(NamedTuple):
     Attributes:
         bench: the workbench.
         seen: what runs along the nominal model and varies, by name.
-        curves: what terms of free form at all places would do to the outputs of the nominal model.
+        terms: of free form, at all places, and what they would do to the outputs of the nominal model.
         parts: what short parts of a disturbance would do, by signal, where harmonic effects may act.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
@@ -43,7 +43,7 @@ class Trials(NamedTuple):
 
     bench: Workbench
     seen: dict[str, Float[np.ndarray, " time"]]
-    curves: Float[np.ndarray, "response record time signal"]
+    terms: Terms
     parts: dict[str, Parts]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Progress
@@ -52,7 +52,7 @@ class Trials(NamedTuple):
 def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and parts of harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    return Trials(bench, seen, responses_of_tests(bench, bench.nominal, seen), parts_of(bench), {}, progress)
+    return Trials(bench, seen, terms_at(bench, bench.nominal, seen), parts_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:
@@ -97,15 +97,16 @@ def refit_screened(
     rest: Sequence[int],
     white: Whitening,
     current: Refits,
-    without_it: Sequence[Float[np.ndarray, " parameter"]],
+    also: Sequence[Float[np.ndarray, " parameter"]] = (),
 ) -> Refits:
-    """Refit each screened candidate beside the effects that are there already, from a point without it.
+    """Refit each screened candidate beside the effects that are there already.
 
-    From the start that promises most, and from points at which it is absent.
+    From the start that promises most, and from where its own numbers lead from a refit without it, and from other
+    points at which it is absent.
     """
     bench = trials.bench
     starts = _most_promising(bench, [_starts(bench, s) for s in some], white, current)
-    grown = _grown(bench, some, without_it, white)
+    grown = _grown(bench, some, [current.points[0], *also], white)
     every = [[start, *points] for start, points in zip(starts, grown, strict=True)]
     return refit_sets(trials, every, [(*rest, s.candidate) for s in some], white, race=True)
 

@@ -124,6 +124,10 @@ class Workbench:
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             return np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
 
+    def stepped(self, points: Float[np.ndarray, "individual parameter"]) -> arithmetic.OutputsAt:
+        """Return the outputs of some points by integration steps per sample, each simulated once."""
+        return functools.cache(lambda substeps: self.simulated(points, substeps=substeps))
+
     def sketched(
         self,
         points: Float[np.ndarray, "individual parameter"],
@@ -250,23 +254,19 @@ def _probe(values: Float[np.ndarray, " time"]) -> float:
 
 def prepared(bench: Workbench) -> Workbench:
     """Return the bench at the step that the nominal model needs, and at the one at which its trials are sketched."""
-    noise_variance, nominal = bench.problem.noise_variance, bench.nominal[None]
-    rough = arithmetic.arithmetic(
-        bench.problem, lambda substeps: bench.simulated(nominal, substeps=substeps), noise_variance, arithmetic.ROUGHLY
-    )
-    return replace(settled(bench, nominal, noise_variance), sketched_at=rough.substeps)
+    noise_variance, outputs_at = bench.problem.noise_variance, bench.stepped(bench.nominal[None])
+    rough = arithmetic.arithmetic(bench.problem, outputs_at, noise_variance, arithmetic.ROUGHLY)
+    return replace(settled(bench, outputs_at, noise_variance), sketched_at=rough.substeps)
 
 
 def settled(
-    bench: Workbench, points: Float[np.ndarray, "individual parameter"], noise_variance: Float[np.ndarray, " signal"]
+    bench: Workbench, outputs_at: arithmetic.OutputsAt, noise_variance: Float[np.ndarray, " signal"]
 ) -> Workbench:
-    """Return the bench at a step at which simulations of some points are as good as exact; itself if it is there.
+    """Return the bench at a step at which its simulations (`stepped`) are as good as exact; itself if it is there.
 
     Readings that no such step knows are no longer measured.
     """
-    problem = arithmetic.settled(
-        bench.problem, lambda substeps: bench.simulated(points, substeps=substeps), noise_variance
-    )
+    problem = arithmetic.settled(bench.problem, outputs_at, noise_variance)
     return bench if problem is bench.problem else replace(bench, problem=problem)
 
 
