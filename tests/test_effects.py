@@ -8,6 +8,7 @@ import pytest
 import ehsvjax
 from ehsvjax.effects import BANK, Effect, amplitude, attach, candidates, effects_of
 from ehsvjax.effects.internal import contexts_of, internal_signals
+from ehsvjax.effects.of_model import effects_for
 from tests.compilations import compilations
 from tests.hidden_plants import effect_sizes, held_levels, servovalve_with, van_der_pol_with
 
@@ -161,6 +162,23 @@ def test_a_model_with_every_effect_passes_the_same_signals_and_can_be_extended_f
     extended, _ = everything_attached(make(), 0.3)
     before, after = contexts_of(make()), contexts_of(extended)
     assert all(set(context) <= set(after[name]) for name, context in before.items())
+
+
+def test_what_is_far_off_is_rarer_and_however_far_no_more_than_rare():
+    error = next(e for e in BANK if e.name == "sensor_gain").parameters[0]
+    rarity = [error.rarity(size) for size in (0.0, 0.05, -0.05, 0.33, 9.0, 1e9)]
+    assert rarity[0] == 0.0 and rarity[1] == rarity[2] == 0.5 and 0.95 < rarity[3] < rarity[4] < 1.0 == rarity[5]
+    # A constant may have been given wrong by any factor; of a friction nobody knows how large it usually is.
+    given = next(e for e in effects_for(ehsvjax.servovalve()) if e.name == "stiffness").parameters[0]
+    assert given.rarity(9.0) == 0.0
+    friction = next(e for e in BANK if e.name == "coulomb_friction").parameters[0]
+    assert friction.rarity(1.0) == friction.rarity(1e6) == 0.5
+
+
+def test_a_usual_size_is_positive():
+    with pytest.raises(ValueError, match="usual of a number of cogging to be positive.*got -1.*inf where any value"):
+        depth = amplitude("depth", "N", lambda s: 1.0, usual=-1.0)
+        Effect("cogging", "force", (depth,), lambda own, force, context: force + own["depth"])
 
 
 def test_an_effect_that_can_never_vanish_is_refused():

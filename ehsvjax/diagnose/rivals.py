@@ -15,9 +15,6 @@ from ehsvjax.diagnose.workbench import Workbench
 
 PER_NUMBER = 4.0
 """Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
-# Noise variances by which anything else must do better than a constant of the model that was given wrong, the
-# commonest cause of all, to come before it.
-_RARER = 1.0
 _SWAPS = 3
 # Noise variances by which a refit has to be better than another to take its place.
 _LOWER = 0.1
@@ -28,10 +25,15 @@ _WORTH_A_REFIT = 100.0
 _LACKS, _PARTS, _SURELY = 0.1, 20, 3.0
 
 
-def price(bench: Workbench, candidate: int) -> float:
-    """Return the noise variances that a candidate must bring beyond another to come before it."""
-    rarer = 0.0 if bench.candidates[candidate].effect.kind == "constant" else _RARER
-    return PER_NUMBER * bench.numbers_of(candidate) + rarer
+def price(bench: Workbench, candidate: int, point: Float[np.ndarray, " parameter"]) -> float:
+    """Return the noise variances that a candidate must bring beyond another to come before it: numbers and rarity.
+
+    A constant that was given wrong, the commonest cause of all, may be off by any factor; a sensor hardly by a third.
+    """
+    found = bench.candidates[candidate]
+    sizes = [n for n in found.effect.parameters if n.absent is not None]
+    rarest = max(n.rarity(bench.value(point, found.parameter(n.name))) for n in sizes)
+    return PER_NUMBER * (bench.numbers_of(candidate) + rarest)
 
 
 class Rival(NamedTuple):
@@ -125,7 +127,7 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
 def _ranked(trials: Trials, own: int, found: Mapping[int, Refits]) -> tuple[Rival, ...]:
     """Return what was refitted in the place of an effect, the best first, with how much worse each is."""
     rivals = [
-        Rival(candidate, _cost(refitted) + price(trials.bench, candidate), refitted)
+        Rival(candidate, _cost(refitted) + price(trials.bench, candidate, refitted.points[0]), refitted)
         for candidate, refitted in found.items()
         if np.isfinite(_cost(refitted))
     ]

@@ -292,7 +292,7 @@ def _next_effect(stage: Stage) -> Stage | None:
         more = ", ..." if len(some) > 3 else ""
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)
-        penalised = refitted.cost + [price(bench, s.candidate) for s in some]
+        penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
         chosen = int(np.argmin(np.where(np.isnan(penalised), np.inf, penalised)))
         if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.white):
             break

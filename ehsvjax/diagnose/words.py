@@ -84,6 +84,7 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
 def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
     lines = []
+    readings = sum(int(np.isfinite(m.residual).sum()) for m in diagnosis.misfit.outputs.values())
     included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
     for row in included.drop_duplicates("cause").itertuples():
         numbers = {
@@ -96,7 +97,10 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             for name, value in numbers.items()
         )
         what = _instead(diagnosis, str(row.cause), numbers) or f"{row.cause} at {row.signal}: {said}"
-        lines.append(f"{what}; without it the sum of squares is {row.likelihood_gain:.4g} noise variances more")
+        lines.append(
+            f"{what}; without it the sum of squares over {readings} readings is {row.likelihood_gain:.4g} times the "
+            f"variance of that noise more"
+        )
     if diagnosis.process_noise is not None:
         place, intensity, *_ = diagnosis.process_noise
         unit = diagnosis.fit.model.unit(place)

@@ -39,6 +39,8 @@ class EffectParameter(NamedTuple):
             of zero has one sign.
         tries: values that the screening simulates, from the scales: one small probe for an amplitude whose effect is
             proportional to it, several for one whose effect is not, or for a shape.
+        usual: how far from `absent` it usually is at most, beyond which it is rare: `inf` where any value is as usual
+            as another; None where nothing is known.
 
     """
 
@@ -48,6 +50,18 @@ class EffectParameter(NamedTuple):
     lower: Callable[[Scales], float]
     upper: Callable[[Scales], float]
     tries: Callable[[Scales], Sequence[float]]
+    usual: float | None = None
+
+    def rarity(self, value: float) -> float:
+        """Return from 0 to 1 how rare a value is: a half where it is as far as usual, or where nothing is known.
+
+        However far, it is no more than rare (Geman & McClure 1987, "Statistical methods for tomographic image
+        reconstruction", for the form).
+        """
+        if self.usual is None or self.absent is None:
+            return 0.5
+        off = (value - self.absent) / self.usual
+        return off**2 / (1.0 + off**2)
 
 
 @dataclass(frozen=True)
@@ -129,6 +143,8 @@ def _check_fields(effect: Effect) -> None:
         text(f"the unit {where}", number_of.unit)
         if number_of.absent is not None:
             number(f"absent {where}", number_of.absent)
+        if number_of.usual not in (None, np.inf):
+            positive(f"usual {where}", number_of.usual, "give inf where any value is as usual as another")
         for field in ("lower", "upper", "tries"):
             function(
                 f"{field} {where}", getattr(number_of, field), "of the scales: lambda scales: 0.1 * scales['value']"
@@ -249,6 +265,7 @@ def amplitude(
     probe: Callable[[Scales], float],
     lower: Callable[[Scales], float] = _no_less,
     upper: Callable[[Scales], float] = _no_more,
+    usual: float | None = None,
 ) -> EffectParameter:
     """Return a number to which the effect is proportional, at least while it is small.
 
@@ -257,7 +274,7 @@ def amplitude(
 
     """
     function("probe", probe, "of the scales: lambda scales: 1e-3 * scales['value']")
-    return EffectParameter(name, unit, 0.0, lower, upper, lambda scales: (probe(scales),))
+    return EffectParameter(name, unit, 0.0, lower, upper, lambda scales: (probe(scales),), usual)
 
 
 def size(

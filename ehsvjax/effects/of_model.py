@@ -1,6 +1,7 @@
 """Effects that only a model can name: a constant that was given wrong, an input that reaches a sensor by itself."""
 
 import functools
+import math
 from collections.abc import Sequence
 
 from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, input_named
@@ -52,7 +53,7 @@ def _off(name: str) -> Effect:
     return Effect(
         name,
         "constant",
-        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
+        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0), usual=math.inf),),
         lambda own, value, context: value * (1.0 + own["error"]),
         says="a constant of the model is another than was given",
         settled_by=_settled_by(name),
@@ -64,7 +65,7 @@ def _there(name: str) -> Effect:
     """Return the effect of a constant that was given as zero and is not, the same object for the same name."""
     number = EffectParameter(
         "value", "{value}", 0.0, lambda s: min(s["least"], 0.0), lambda s: s["value"],
-        lambda s: [share * s["value"] for share in (1e-4, 1e-2, 0.3)],
+        lambda s: [share * s["value"] for share in (1e-4, 1e-2, 0.3)], usual=math.inf,
     )  # fmt: skip
     return Effect(
         name,
