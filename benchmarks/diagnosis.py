@@ -11,7 +11,6 @@ processes, one on each core; each trial can be repeated from its seed.
 """
 
 import argparse
-import json
 import sys
 import time
 import traceback
@@ -25,10 +24,9 @@ import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from tqdm import tqdm
 
 import ehsvjax
-from benchmarks.processes import workers
+from benchmarks.processes import rows_of
 from ehsvjax.diagnose import Diagnosis, diagnose
 from ehsvjax.diagnose.missing import MissingTerm
 from tests.hidden_oracle import SEPARABLE, oracle, worth_each
@@ -259,18 +257,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of all trials")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    trials = trials_of(options)
-    chunks = []
-    for key in dict.fromkeys((t.kind, t.hidden.model) for t in trials):
-        same = [t for t in trials if (t.kind, t.hidden.model) == key]
-        chunks += [same[k : k + 8] for k in range(0, len(same), 8)]
-    rows: list[dict[str, Any]] = []
-    with workers() as pool:
-        # In the order in which they end: what has been measured is kept, even if the rest is interrupted.
-        for found in tqdm(pool.map(tried, chunks), total=len(chunks), mininterval=10.0):
-            rows += found
-            (options.out / "diagnosis.json").write_text(json.dumps(rows, indent=1, default=float))
+    rows = rows_of(tried, trials_of(options), lambda t: (t.kind, t.hidden.model), options.out / "diagnosis.json")
     table = pd.DataFrame(rows)
     table["outcome"] = [outcome(row) for _, row in table.iterrows()]
     for line in summary(table):

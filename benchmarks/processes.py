@@ -1,8 +1,17 @@
 """Processes side by side, one on each core, for draws and trials that have nothing to do with each other."""
 
+import json
 import multiprocessing
 import os
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+# Trials of one kind that a process makes and diagnoses together: an own plant steps them all at once.
+_TOGETHER = 8
 
 
 def workers() -> ProcessPoolExecutor:
@@ -12,3 +21,23 @@ def workers() -> ProcessPoolExecutor:
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+
+
+def rows_of(
+    tried: Callable[[list], list[dict[str, Any]]], trials: Sequence, kind: Callable[[Any], Hashable], path: Path
+) -> list[dict[str, Any]]:
+    """Return the rows of all trials, tried side by side, those of one kind together.
+
+    What has been measured is kept in the file, even if the rest is interrupted.
+    """
+    chunks = []
+    for key in dict.fromkeys(map(kind, trials)):
+        same = [trial for trial in trials if kind(trial) == key]
+        chunks += [same[k : k + _TOGETHER] for k in range(0, len(same), _TOGETHER)]
+    rows: list[dict[str, Any]] = []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with workers() as pool:
+        for found in tqdm(pool.map(tried, chunks), total=len(chunks), mininterval=10.0):
+            rows += found
+            path.write_text(json.dumps(rows, indent=1, default=float))
+    return rows

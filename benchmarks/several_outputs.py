@@ -9,7 +9,6 @@ refit of everything else in the plant leaves, in noise variances.
 """
 
 import argparse
-import json
 import sys
 import time
 import traceback
@@ -22,10 +21,9 @@ import jax
 import numpy as np
 import pandas as pd
 from scipy.optimize import least_squares
-from tqdm import tqdm
 
 import ehsvjax
-from benchmarks.processes import workers
+from benchmarks.processes import rows_of
 from ehsvjax.diagnose import diagnose
 from tests.hidden_plants import SERVOVALVE_EFFECTS, servovalve_with
 from tests.hidden_records import Hidden, sizes_of
@@ -209,17 +207,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of all trials")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    trials = trials_of(options)
-    chunks = []
-    for kind in dict.fromkeys(t.kind for t in trials):
-        same = [t for t in trials if t.kind == kind]
-        chunks += [same[k : k + 8] for k in range(0, len(same), 8)]
-    rows: list[dict[str, Any]] = []
-    with workers() as pool:
-        for found in tqdm(pool.map(tried, chunks), total=len(chunks), mininterval=10.0):
-            rows += found
-            (options.out / "several_outputs.json").write_text(json.dumps(rows, indent=1, default=float))
+    rows = rows_of(tried, trials_of(options), lambda t: t.kind, options.out / "several_outputs.json")
     table = pd.DataFrame(rows)
     table["outcome"] = [outcome(row) for _, row in table.iterrows()]
     table["measured"] = table["outputs"].map(", ".join)

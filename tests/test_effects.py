@@ -176,8 +176,8 @@ def test_what_is_far_off_is_rarer_and_however_far_no_more_than_rare():
 
 
 def test_a_usual_size_is_positive():
+    depth = amplitude("depth", "N", lambda s: 1.0, usual=-1.0)
     with pytest.raises(ValueError, match="usual of a number of cogging to be positive.*got -1.*inf where any value"):
-        depth = amplitude("depth", "N", lambda s: 1.0, usual=-1.0)
         Effect("cogging", "force", (depth,), lambda own, force, context: force + own["depth"])
 
 
