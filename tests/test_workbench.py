@@ -10,6 +10,7 @@ from ehsvjax.diagnose.curves import bench_with, outputs_with, probe_at, quantiti
 from ehsvjax.diagnose.noise import plain_noise
 from ehsvjax.diagnose.refits import padded, refit
 from ehsvjax.diagnose.screening import Screened
+from ehsvjax.diagnose.selection import _look, _weighed
 from ehsvjax.diagnose.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnose.workbench import workbench
 from ehsvjax.effects import BANK
@@ -124,3 +125,13 @@ def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
     found = refit_screened(trials, some, (), white, without)
     assert found.points[0, column] * unit == pytest.approx(0.7, rel=0.02)
     assert found.cost[0] < 1.2 * SAMPLES < found.cost[1] < without.cost[0]
+
+
+def test_a_single_cause_that_the_record_can_do_without_is_needless(bench):
+    # What was found before readings beside a jump were left out may have been these readings.
+    cause = [c.name for c in bench.candidates].index("input_saturation")
+    trials = trials_of(bench, lambda stage: None)
+    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    nominal, found = (refit_sets(trials, [[bench.nominal]], [some], white) for some in ((), (cause,)))
+    weighed = _weighed(_look(trials, (cause,), found, white), nominal)
+    assert weighed.stage.included == (weighed.needless,), weighed.gains

@@ -356,4 +356,4 @@ def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None
         gains.append(gain)
         spare[i] = gain - required_gain(trials.bench, stage.screening, i)
     least = min(spare, key=lambda i: spare[i], default=None)
-    return tuple(gains), least if len(spare) > 1 and least is not None and spare[least] < 0.0 else None
+    return tuple(gains), least if least is not None and spare[least] < 0.0 else None
