@@ -49,7 +49,7 @@ def _switch() -> Model:
     )
 
 
-@pytest.mark.parametrize(("before", "beside"), [(3e-4, [50]), (0.5 * PERIOD, [])])
+@pytest.mark.parametrize(("before", "beside"), [(3e-4, [50]), (3e-3, [50]), (0.5 * PERIOD, [])])
 def test_a_reading_within_the_error_of_a_jump_carries_no_weight(before, beside):
     # The level rises by 1 m/s: it passes the edge so long before sample 50. The edge is known to some 1.4 mm.
     time, edge = PERIOD * np.arange(SAMPLES), 50 * PERIOD - before

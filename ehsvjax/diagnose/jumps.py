@@ -15,8 +15,9 @@ from ehsvjax.diagnose.noise import Whitening, standing_alone
 from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 
-# Deviations of the noise by which a reading may bend over the unknowns' standard errors, more than its neighbours.
-_STRAIGHT = 0.3
+# Standard errors of the unknowns over which a jump is looked for: of many jumps a third lie beyond one of them. And
+# deviations of the noise by which a reading may bend over them, more than its neighbours.
+_ERRORS, _STRAIGHT = 3.0, 0.3
 
 
 def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbench:
@@ -37,8 +38,8 @@ def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbe
         return bench
     vectors, values, _ = np.linalg.svd(jacobian[seen] / norms[seen, None], full_matrices=False)
     kept = values > TOLD_APART * values[0]
-    # Of each principal direction one standard error.
-    errors = vectors[:, kept] / values[kept] / norms[seen, None]
+    # Along each principal direction.
+    errors = _ERRORS * vectors[:, kept] / values[kept] / norms[seen, None]
     moved = columns[seen]
     lower, upper = bounds_of(bench)
     points = np.repeat(point[None], 1 + 2 * errors.shape[1], axis=0)
