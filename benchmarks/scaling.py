@@ -102,14 +102,15 @@ sys.path[:0] = [sys.argv[1], sys.argv[1] + "/benchmarks"]
 import common, jax
 import jax.numpy as jnp
 from dataclasses import replace
-from ehsvjax.population import Samples, population_cost
+from ehsvjax.population import population_cost
 case = common.cases()["van_der_pol"]
 problem = case.problem
 count = 1_000_000 // problem.grid.substeps
 repeats = -(-count // problem.samples.inputs.shape[1])
 long = lambda leaf: jnp.tile(leaf, (1, repeats, 1))[:, :count]
 s = problem.samples
-problem = replace(problem, samples=Samples(long(s.inputs), long(s.outputs), long(s.measured), s.sample_period))
+longer = s._replace(inputs=long(s.inputs), outputs=long(s.outputs), measured=long(s.measured))
+problem = replace(problem, samples=longer)
 compiled = jax.jit(population_cost).lower(problem, common.individuals(case, 4096)).compile()
 
 def most():

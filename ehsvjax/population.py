@@ -22,19 +22,23 @@ from jaxtyping import Array, Bool, Float
 from ehsvjax import kernels
 from ehsvjax.models.model import Equations, Model, Parameter, identity
 from ehsvjax.record import Record
-from ehsvjax.simulate import Grid, grid_of, input_array, scan_model
+from ehsvjax.simulate import Grid, constants_of, grid_of, input_array, scan_model
 
 # Samples whose squares are added up plainly before the sum is added to the rest.
 _SUMMED_TOGETHER = 64
 
 
 class Samples(NamedTuple):
-    """Records side by side, padded at the end to the longest; `measured` is False where there is no sample."""
+    """Records side by side, padded at the end to the longest; `measured` is False where there is no sample.
+
+    `constants` are the parameters that are known in some record, by name; NaN in the others.
+    """
 
     inputs: Float[Any, "record time input"]
     outputs: Float[Any, "record time signal"]
     measured: Bool[Any, "record time signal"]
     sample_period: Float[Any, " record"]
+    constants: dict[str, Float[Any, " record"]]
 
 
 class Coordinates(NamedTuple):
@@ -112,7 +116,8 @@ def stack_records(model: Model, records: Sequence[Record]) -> tuple[Samples, Gri
     The signals are those of `observed_outputs`; where a record does not hold one of them, nothing is measured.
 
     Raises:
-        ValueError: if the records differ in hold, lack an input, or hold outputs that the model does not have.
+        ValueError: if the records differ in hold, lack an input, or hold outputs or constants that the model does not
+            have.
 
     """
     holds = sorted({record.hold for record in records})
@@ -128,12 +133,16 @@ def stack_records(model: Model, records: Sequence[Record]) -> tuple[Samples, Gri
         return np.stack([record.outputs.get(name, absent) for name in observed], axis=-1)
 
     observed = observed_outputs(model, records)
+    constants = [constants_of(model, record) for record in records]
     stacked = np.stack([padded(measured(record), np.nan) for record in records])
     samples = Samples(
         inputs=np.stack([padded(input_array(model, record), 0.0) for record in records]),
         outputs=np.nan_to_num(stacked, nan=0.0),
         measured=np.isfinite(stacked),
         sample_period=np.array([record.sample_period for record in records]),
+        constants={
+            name: np.array([c.get(name, np.nan) for c in constants]) for name in sorted(set().union(*constants))
+        },
     )
     substeps = max(grid_of(model, record).substeps for record in records)
     return samples, Grid(substeps, holds[0])
@@ -313,11 +322,12 @@ def huber_weight(standardised: Float[Array, "..."], huber: float | None) -> Floa
 
 
 def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest, scan=kernels.scan):
+    here = {n: jnp.where(jnp.isnan(value), parameters[n], value) for n, value in samples.constants.items()}
     return scan_model(
         problem.equations._replace(stepper=_stored_once(problem.equations.stepper)),
         problem.grid if problem.substeps is None else problem.grid._replace(substeps=problem.substeps),
         identity,
-        parameters,
+        parameters | here,
         initial,
         samples.inputs,
         samples.sample_period,

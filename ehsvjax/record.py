@@ -15,7 +15,15 @@ from ehsvjax.checks import as_number, flag, instance, refused, shown
 from ehsvjax.columns import Column, pick, unknown_name, vector
 from ehsvjax.matlab import mat_table
 from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
-from ehsvjax.record_checks import TOLERANCE, check_names, check_samples, check_settings, check_time, check_uniform
+from ehsvjax.record_checks import (
+    TOLERANCE,
+    check_names,
+    check_samples,
+    check_settings,
+    check_time,
+    check_uniform,
+    checked_constants,
+)
 
 if TYPE_CHECKING:
     import pandas
@@ -38,6 +46,8 @@ class Record:
         hold: what the inputs do between samples, "zero" or "linear".
         name: what the record is called in print and in legends.
         uniform: False admits non-uniform time, for a record that is then resampled: `sample_period` refuses it.
+        constants: name of a model's parameter -> its value, SI, where it is known for this record and may be another in
+            other records: the supply pressure of that day, a load mass. It holds whatever is said or found elsewhere.
 
     """
 
@@ -47,6 +57,7 @@ class Record:
     hold: Literal["zero", "linear"] = "zero"
     name: str = "record"
     uniform: bool = True
+    constants: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check and copy the arguments."""
@@ -64,6 +75,7 @@ class Record:
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "inputs", MappingProxyType(inputs))
         object.__setattr__(self, "outputs", MappingProxyType(outputs))
+        object.__setattr__(self, "constants", MappingProxyType(checked_constants(self.constants)))
 
     def __len__(self) -> int:
         """Count the samples."""
@@ -170,6 +182,13 @@ class Record:
             if outputs.count(name) > 1:
                 raise ValueError(f"output {name!r} is named {outputs.count(name)} times: name it once")
         return replace(self, outputs={name: self.outputs[name] for name in outputs})
+
+    def at(self, **constants: float) -> "Record":
+        """Say what is known about this record besides: `record.at(supply_pressure=70e5)`.
+
+        Raises ValueError for a value that is no finite number.
+        """
+        return replace(self, constants={**self.constants, **constants})
 
     def to_dataframe(self) -> "pandas.DataFrame":
         """Copy to a pandas data frame: `time` (s), then the inputs, then the outputs by name (SI units)."""
@@ -307,11 +326,13 @@ class Record:
         width = max(map(len, [*self.inputs, *self.outputs]), default=0)
         inputs = [f"  input   {name:{width}}  {_range(values)}" for name, values in self.inputs.items()]
         outputs = [f"  output  {name:{width}}  {_range(values)}" for name, values in self.outputs.items()]
-        return "\n".join([head, *inputs, *outputs])
+        constants = [f"  at {name} = {value:.6g}" for name, value in self.constants.items()]
+        return "\n".join([head, *inputs, *outputs, *constants])
 
     def __reduce__(self) -> tuple:
         """Pickle and copy by the constructor's arguments: a read-only mapping cannot be pickled itself."""
-        return Record, (self.time, dict(self.inputs), dict(self.outputs), self.hold, self.name, self.uniform)
+        signals = (self.time, dict(self.inputs), dict(self.outputs))
+        return Record, (*signals, self.hold, self.name, self.uniform, dict(self.constants))
 
     def _span(self) -> str:
         return f"{self.time[0]:.6g} to {self.time[-1]:.6g} s"

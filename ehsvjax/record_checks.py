@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.checks import choice, flag, instance, shown
+from ehsvjax.checks import by_name, choice, flag, instance, number, shown
 
 # Share of a period by which a time stamp may be off the uniform grid through the first and the last one.
 # Stamps within 1 % of any straight line always keep to it, as the grid is then itself off by at most 1 %.
@@ -35,6 +35,12 @@ def check_names(inputs: Any, outputs: Any) -> None:
     for name in inputs:
         if name in outputs:
             raise ValueError(f"signal {name!r} is both an input and an output: rename one or leave it out")
+
+
+def checked_constants(constants: Any) -> dict[str, float]:
+    """Return what was known about a record by name; ValueError for what are no numbers by name."""
+    found = by_name("constants", constants, "{'supply_pressure': 70e5}")
+    return {name: number(name, value, remedy="give its value, SI") for name, value in found.items()}
 
 
 def check_time(time: Float[np.ndarray, " time"]) -> None:

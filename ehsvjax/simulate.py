@@ -48,7 +48,7 @@ def simulate(
 
     Args:
         model: the model.
-        record: gives time and inputs; its outputs are not looked at.
+        record: gives time, inputs and what is known of its constants; its outputs are not looked at.
         parameters: values that differ from the nominal ones, SI.
         initial: initial conditions that differ from the nominal ones, SI.
         substeps: integration steps per sample; by default as many as the model's `max_step` asks for.
@@ -66,7 +66,7 @@ def simulate(
     instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
     checked_record(record)
     function("signal", signal, "signal(name, value, **context) -> value")
-    values = changed(model, "parameters", model.nominal, parameters)
+    values = changed(model, "parameters", model.nominal, parameters) | constants_of(model, record)
     start = changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
     grid = grid_of(model, record, substeps)
     inputs = input_array(model, record)
@@ -105,6 +105,22 @@ def changed(
             raise ValueError(f"expected one of the {kind} of {model.name} here, got {name!r}; they are {known}")
         changes[name] = number(name, value, remedy="give its value, SI")
     return {**nominal, **changes}
+
+
+def constants_of(model: Model, record: Record) -> dict[str, float]:
+    """Return what is known of a model's parameters in a record.
+
+    Raises:
+        ValueError: for a name that is no parameter of the model.
+
+    """
+    for name in record.constants:
+        if name not in model.nominal:
+            raise ValueError(
+                f"expected the constants of {record.name} to be parameters of {model.name}, "
+                f"{', '.join(model.nominal)}; got {name!r}: mind the spelling"
+            )
+    return dict(record.constants)
 
 
 def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:

@@ -71,6 +71,13 @@ def _sections(fit: Fit) -> Iterator[_Section]:
     yield _Section("Model", _model_rows(fit.model))
     title = "Record" if len(fit.records) == 1 else "Records"
     yield _Section(title, [_record_row(record) for record in fit.records], _RECORD_HEAD)
+    known = [
+        (r.name, name, f"{value:.6g}", fit.model.parameter(name).unit)
+        for r in fit.records
+        for name, value in r.constants.items()
+    ]
+    if known:
+        yield _Section("Known of a record", known, ("record", "constant", "value", "unit"))
     yield _Section("Fit statistics", _statistics_rows(fit))
     yield _Section("Outputs", _output_rows(fit), _OUTPUT_HEAD)
     precision = _precision_of(fit)

@@ -49,6 +49,7 @@ def problem_of(
     unknowns = [model.parameter(name) for name in model.free]
     for record in records:
         unknowns += [_wide_enough(model.parameter(name), record) for name in free_initial]
+    _check_not_all_known(model, records)
     _check_enough_samples(model, records, samples.measured, unknowns)
     return Problem(
         samples=samples,
@@ -192,6 +193,15 @@ def checked_variance(model: Model, output: str, variance: Any) -> float:
 
     """
     return positive(f"noise_variance of {output}", variance, f"give it in ({model.unit(output)})^2")
+
+
+def _check_not_all_known(model, records):
+    for name in model.free:
+        if all(name in record.constants for record in records):
+            raise ValueError(
+                f"expected a record that {name} can be identified from, got its value with every one: fix it "
+                f"(fixed={{{name!r}: value}}), or leave it out of the constants"
+            )
 
 
 def _check_enough_samples(model, records, measured, unknowns):
