@@ -176,8 +176,12 @@ def spikes(
     return found
 
 
-def standing_alone(series: Float[np.ndarray, "record time"], apart: float) -> Bool[np.ndarray, "record time"]:
+def standing_alone(
+    series: Float[np.ndarray, "record time"], apart: float, sides: Sequence[int] = (1, -1)
+) -> Bool[np.ndarray, "record time"]:
     """Return samples that lie further than this on one side of all but one of the three before and the three after.
+
+    Above them (1), or below (-1).
 
     At an end of the record, and beside what is missing, there are fewer.
     """
@@ -186,7 +190,8 @@ def standing_alone(series: Float[np.ndarray, "record time"], apart: float) -> Bo
     length = series.shape[1]
     neighbours = np.stack([filled[:, k : k + length] for k in range(2 * reach + 1) if k != reach])
     needed = np.maximum(np.sum(np.isfinite(neighbours), axis=0) - 1, 2)
-    return np.maximum(*(np.sum(side * (series - neighbours) > apart, axis=0) for side in (1, -1))) >= needed
+    beyond = [np.sum(side * (series - neighbours) > apart, axis=0) for side in sides]
+    return np.max(beyond, axis=0) >= needed
 
 
 def lattice(values: Float[np.ndarray, " time"]) -> float | None:
