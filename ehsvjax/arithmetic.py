@@ -123,8 +123,7 @@ def arithmetic(
         order = np.argsort(squares)
         below = np.cumsum(squares[order])
         kept = int(np.searchsorted(below, _WORTH, side="right"))
-        known = measured.copy()
-        known[measured] = False
+        known = np.zeros_like(measured)
         known.flat[np.flatnonzero(measured)[order[:kept]]] = True
         if few(measured & ~known, measured, left_out):
             break

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ehsvjax.arithmetic import LEFT_OUT, few
-from ehsvjax.diagnose.noise import Whitening, standing_alone
+from ehsvjax.diagnose.noise import Whitening, standing_out
 from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 
@@ -48,8 +48,8 @@ def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbe
     forward, backward = np.split(outputs[1:], 2)
     bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0)
     apart = _STRAIGHT * np.sqrt(white.variances)
-    # Above the others: the first reading of a bend that begins bends less.
-    alone = [standing_alone(bent[..., i], limit, sides=(1,)) for i, limit in enumerate(apart)]
+    # More than the others: the first reading of a bend that begins bends less.
+    alone = [standing_out(bent[..., i], limit) for i, limit in enumerate(apart)]
     jumping = samples.measured & np.stack(alone, axis=-1)
     # More than that no jump bends.
     if not jumping.any() or not few(jumping, samples.measured, LEFT_OUT):

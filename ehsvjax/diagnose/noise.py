@@ -171,17 +171,14 @@ def spikes(
         if spread == 0.0:
             continue
         seen = (np.where(measured[..., i], series[..., i], np.nan) for series in (residual, outputs))
-        alone = [standing_alone(series, _SPIKE * spread) for series in seen]
+        apart = _SPIKE * spread
+        alone = [standing_out(series, apart) | standing_out(-series, apart) for series in seen]
         found[..., i] = alone[0] & alone[1] & measured[..., i]
     return found
 
 
-def standing_alone(
-    series: Float[np.ndarray, "record time"], apart: float, sides: Sequence[int] = (1, -1)
-) -> Bool[np.ndarray, "record time"]:
-    """Return samples that lie further than this on one side of all but one of the three before and the three after.
-
-    Above them (1), or below (-1).
+def standing_out(series: Float[np.ndarray, "record time"], apart: float) -> Bool[np.ndarray, "record time"]:
+    """Return samples that lie further than this above all but one of the three before and the three after.
 
     At an end of the record, and beside what is missing, there are fewer.
     """
@@ -190,8 +187,7 @@ def standing_alone(
     length = series.shape[1]
     neighbours = np.stack([filled[:, k : k + length] for k in range(2 * reach + 1) if k != reach])
     needed = np.maximum(np.sum(np.isfinite(neighbours), axis=0) - 1, 2)
-    beyond = [np.sum(side * (series - neighbours) > apart, axis=0) for side in sides]
-    return np.max(beyond, axis=0) >= needed
+    return np.sum(series - neighbours > apart, axis=0) >= needed
 
 
 def lattice(values: Float[np.ndarray, " time"]) -> float | None:
