@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-# Trials of one kind that a process makes and diagnoses together: an own plant steps them all at once.
+# Trials of one kind that a process makes and diagnoses together, at most: an own plant steps them all at once.
 _TOGETHER = 8
 
 
@@ -33,7 +33,9 @@ def rows_of(
     chunks = []
     for key in dict.fromkeys(map(kind, trials)):
         same = [trial for trial in trials if kind(trial) == key]
-        chunks += [same[k : k + _TOGETHER] for k in range(0, len(same), _TOGETHER)]
+        # No core is to wait while the last of a few trials are diagnosed on another.
+        together = min(_TOGETHER, -(-len(same) // (2 * (os.cpu_count() or 1))))
+        chunks += [same[k : k + together] for k in range(0, len(same), together)]
     rows: list[dict[str, Any]] = []
     path.parent.mkdir(parents=True, exist_ok=True)
     with workers() as pool:

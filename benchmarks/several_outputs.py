@@ -37,6 +37,8 @@ FINE_STEP = 1e-5
 CONSTANTS = ("mass", "stiffness", "piston_area", "supply_pressure", "leakage_coefficient")
 # Noise variances from which an effect can be told from nothing.
 SEEN = 25.0
+# And deviations of the noise between two readings that are a jump.
+JUMP = 10.0
 
 
 class Trial(NamedTuple):
@@ -126,20 +128,29 @@ def made(trials: list[Trial]) -> list[dict[str, np.ndarray]]:
     return found
 
 
+def _steady(output: np.ndarray) -> np.ndarray:
+    """Return which readings of an output, in deviations of its noise, are less than a jump from both neighbours."""
+    near = np.abs(np.diff(output)) < JUMP
+    return np.append(True, near) & np.append(near, True)
+
+
 def worth(trial: Trial, clean: dict[str, np.ndarray]) -> float:
-    """Return the noise variances that a wrong constant leaves when everything else is refitted in the plant."""
+    """Return the noise variances that a wrong constant leaves when everything else is refitted in the plant.
+
+    Of readings that are not beside a jump: on those the plant's own last bit would decide.
+    """
     names = ("dead_zone", "saturation", "flow_gain", "feedback_gain", "damping_ratio", "natural_frequency")
     start = np.array([getattr(Valve(), name) for name in names])
     command = excited(trial)
     # In proportion where the supply or the area is absorbed by the flow gain.
     ratio = {"supply_pressure": trial.factor**0.5, "piston_area": 1.0 / trial.factor}.get(trial.name, 1.0)
     start[2] *= ratio
+    steady = {name: _steady(clean[name] / NOISE[name]) for name in trial.outputs}
 
     def left(logarithms):
         values = dict(zip(names, start * np.exp(logarithms), strict=True))
         motion = servovalve_plant(command, PERIOD, rtol=1e-8, **values, **given(trial))
-        # Readings beside a jump tell of the arithmetic only.
-        return np.concatenate([np.clip((getattr(motion, n) - clean[n]) / NOISE[n], -30, 30) for n in trial.outputs])
+        return np.concatenate([(getattr(motion, n) - clean[n])[steady[n]] / NOISE[n] for n in trial.outputs])
 
     best = least_squares(left, np.zeros(len(names)), diff_step=1e-4, max_nfev=12, xtol=1e-6, ftol=1e-4)
     return float(2.0 * best.cost)
