@@ -27,11 +27,13 @@ benchmarks: $(VENV)/installed-benchmark
 	$(BIN)/python benchmarks/wide_bounds.py
 	$(BIN)/python benchmarks/precision.py
 	$(BIN)/python benchmarks/diagnosis.py
+	$(BIN)/python benchmarks/several_outputs.py
 	$(BIN)/python benchmarks/generations_per_second.py
 	$(BIN)/python benchmarks/against_c.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/cold_start.py
 	$(BIN)/python benchmarks/damaged_files.py
+	$(BIN)/python benchmarks/damaged_calls.py
 
 $(VENV)/bin/python:
 	$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'ehsvjax needs Python 3.11 or newer')"

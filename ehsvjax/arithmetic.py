@@ -82,7 +82,7 @@ def _outputs_at(problem: Problem, individual) -> OutputsAt:
 def settled(
     problem: Problem,
     outputs_at: OutputsAt,
-    noise_variance: Float[np.ndarray, " signal"],
+    noise_variance: Float[np.ndarray, "*record signal"],
     left_out: float = LEFT_OUT,
 ) -> Problem:
     """Return the problem at a step at which some simulations are as good as exact; itself if it is there already.
@@ -99,7 +99,7 @@ def settled(
 def arithmetic(
     problem: Problem,
     outputs_at: OutputsAt,
-    noise_variance: Float[np.ndarray, " signal"],
+    noise_variance: Float[np.ndarray, "*record signal"],
     left_out: float = LEFT_OUT,
 ) -> Arithmetic:
     """Return the step at which some simulations are as good as exact, for all of them together.
@@ -107,13 +107,13 @@ def arithmetic(
     Args:
         problem: what is simulated; the step is not made longer than it is there.
         outputs_at: simulates, in the outputs' units.
-        noise_variance: of each output, in its unit squared.
+        noise_variance: of each output, in its unit squared, one for all records or one for each.
         left_out: share of each output's readings that are left out before the step is halved.
 
     """
     readings, measured, here = problem.samples.outputs, problem.samples.measured, int(problem.substeps)
     spread = np.array([np.var(readings[..., i][measured[..., i]]) for i in range(readings.shape[-1])])
-    variance = np.maximum(noise_variance, _LEAST_NOISE**2 * spread)
+    variance = np.maximum(np.asarray(noise_variance)[..., None, :], _LEAST_NOISE**2 * spread)
     at = cache(outputs_at)
     while True:
         # Comparisons of a failed simulation with anything are NaN: nothing is known there.

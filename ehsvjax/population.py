@@ -3,8 +3,8 @@
 A `Problem` is everything that a simulation needs but the candidates: the records, the noise, what is known, and the
 coordinates of what is not. Its arrays may change without compiling again.
 
-An individual is a point of the unit cube, one coordinate per unknown: the free parameters first, then the unknown
-initial conditions of each record in turn.
+An individual is a point of the unit cube, one coordinate per unknown: the free parameters first, then, of each record
+in turn, those that are its own and its unknown initial conditions.
 """
 
 import functools
@@ -52,7 +52,7 @@ class Coordinates(NamedTuple):
 @functools.partial(
     jax.tree_util.register_dataclass,
     data_fields=["samples", "noise_variance", "coordinates", "known", "known_initial", "substeps"],
-    meta_fields=["equations", "grid", "observed", "free", "free_initial", "huber"],
+    meta_fields=["equations", "grid", "observed", "free", "free_initial", "huber", "free_by_record"],
 )
 @dataclass(frozen=True)
 class Problem:
@@ -70,6 +70,7 @@ class Problem:
         free_initial: names of the initial conditions that are free, static.
         huber: residuals beyond this many standard deviations weigh linearly (Huber 1964); None: squares; static.
         substeps: integration steps per sample as data, for one program at any step; None: as many as the grid says.
+        free_by_record: names of parameters that are free and may be another in every record, static.
 
     """
 
@@ -85,11 +86,18 @@ class Problem:
     free_initial: tuple[str, ...]
     huber: float | None
     substeps: Any = None
+    free_by_record: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Name of the unknown of each coordinate; of what each record has for itself, `name[record]`."""
+        own = (*self.free_by_record, *self.free_initial)
+        return [*self.free, *(f"{name}[{k}]" for k in range(len(self.samples.inputs)) for name in own)]
 
     @property
     def unknowns(self) -> int:
         """Number of coordinates of an individual."""
-        return len(self.free) + len(self.free_initial) * self.samples.inputs.shape[0]
+        return len(self.names)
 
 
 def observed_outputs(model: Model, records: Sequence[Record]) -> tuple[str, ...]:
@@ -195,8 +203,8 @@ def population_cost(problem: Problem, individuals: Float[Array, "individual para
     """
 
     def costs_by_record(individual):
-        parameters, initial = _split(problem, individual)
-        return jax.vmap(functools.partial(_record_cost, problem, parameters))(initial, problem.samples)
+        parameters, own = _split(problem, individual)
+        return jax.vmap(functools.partial(_record_cost, problem, parameters))(own, problem.samples)
 
     def gradients_by_record(rows):
         # The tangents' axis comes first and the individuals stay side by side, as in the cost.
@@ -257,14 +265,14 @@ def simulated(problem: Problem, individual: Float[Array, " parameter"]) -> Float
         return carry, jnp.stack([outputs[name] for name in problem.observed])
 
     def trajectories(individual):
-        parameters, initial = _split(problem, individual)
+        parameters, own = _split(problem, individual)
         trajectory = functools.partial(_scan, problem, parameters, visit=keep, carry=None, rest=None)
-        return jax.vmap(lambda initial, samples: trajectory(initial, samples)[1])(initial, problem.samples)
+        return jax.vmap(lambda own, samples: trajectory(own, samples)[1])(own, problem.samples)
 
     return trajectories(individual)
 
 
-def _record_cost(problem: Problem, parameters, initial, samples: Samples):
+def _record_cost(problem: Problem, parameters, own, samples: Samples):
     scale = 1.0 / jnp.sqrt(problem.noise_variance)
 
     def accumulate(total, outputs, sample):
@@ -276,7 +284,7 @@ def _record_cost(problem: Problem, parameters, initial, samples: Samples):
 
     zero = jnp.zeros((), samples.outputs.dtype)
     rest = (samples.outputs, samples.measured)
-    return _scan(problem, parameters, initial, samples, accumulate, zero, rest, _scan_by_parts)[0]
+    return _scan(problem, parameters, own, samples, accumulate, zero, rest, _scan_by_parts)[0]
 
 
 def _scan_by_parts(body: Callable, carry: Any, samples: Any):
@@ -321,8 +329,10 @@ def huber_weight(standardised: Float[Array, "..."], huber: float | None) -> Floa
     return huber / jnp.maximum(jnp.abs(standardised), huber)
 
 
-def _scan(problem: Problem, parameters, initial, samples: Samples, visit, carry, rest, scan=kernels.scan):
+def _scan(problem: Problem, parameters, own, samples: Samples, visit, carry, rest, scan=kernels.scan):
     here = {n: jnp.where(jnp.isnan(value), parameters[n], value) for n, value in samples.constants.items()}
+    here |= {n: own[n] for n in problem.free_by_record}
+    initial = {n: value for n, value in own.items() if n not in problem.free_by_record}
     return scan_model(
         problem.equations._replace(stepper=_stored_once(problem.equations.stepper)),
         problem.grid if problem.substeps is None else problem.grid._replace(substeps=problem.substeps),
@@ -349,10 +359,10 @@ def _stored_once(stepper):
 
 
 def _split(problem: Problem, individual) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Return parameters by name, and initial conditions by name `[record]`."""
+    """Return parameters by name, and by name `[record]` what each has for itself: initial conditions, parameters."""
     values = to_values(problem.coordinates, individual)
     count = len(problem.free)
     parameters = problem.known | dict(zip(problem.free, values[:count], strict=True))
-    by_record = values[count:].reshape(problem.samples.inputs.shape[0], len(problem.free_initial))
-    initial = problem.known_initial | dict(zip(problem.free_initial, by_record.T, strict=True))
-    return parameters, initial
+    own = (*problem.free_by_record, *problem.free_initial)
+    by_record = values[count:].reshape(problem.samples.inputs.shape[0], len(own))
+    return parameters, problem.known_initial | dict(zip(own, by_record.T, strict=True))

@@ -400,8 +400,8 @@ def checked_record(record: Any) -> Record:
     return instance("record", record, Record, _MAKE_ONE)
 
 
-def checked_records(records: Any) -> tuple[Record, ...]:
-    """Return one record, or a sequence of them, as a tuple.
+def checked_records(records: Any, name: str = "records") -> tuple[Record, ...]:
+    """Return one record, or a sequence of them, as a tuple; `name` is what the argument is called.
 
     Raises:
         ValueError: for none, or anything else.
@@ -409,7 +409,7 @@ def checked_records(records: Any) -> tuple[Record, ...]:
     """
     listed = (records,) if isinstance(records, Record) else tuple(records) if isinstance(records, Sequence) else ()
     if not listed or not all(isinstance(record, Record) for record in listed):
-        raise refused("records", "a Record or a sequence of Records", records, _MAKE_ONE)
+        raise refused(name, "a Record or a sequence of Records", records, _MAKE_ONE)
     return listed
 
 

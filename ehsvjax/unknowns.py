@@ -27,6 +27,7 @@ def problem_of(
     initial: Initial = "estimate",
     noise_variance: Mapping[str, float] | None = None,
     huber: float | None = None,
+    by_record: Sequence[str] = (),
 ) -> Problem:
     """Return the problem of identifying a model's free parameters, in NumPy float64.
 
@@ -37,6 +38,7 @@ def problem_of(
             that are known (the others are estimated), one for all records or one for each.
         noise_variance: of each output, in its unit squared; by default guessed from the record, `guess_noise_variance`.
         huber: see `Problem`.
+        by_record: names of free parameters that may be another in every record.
 
     Raises:
         ValueError: for records without samples enough, unknown names, values that are no variances.
@@ -46,8 +48,10 @@ def problem_of(
     observed = observed_outputs(model, records)
     free_initial = tuple(p.name for p in model.initial if any(p.name not in g for g in given))
     samples, grid = stack_records(model, records)
-    unknowns = [model.parameter(name) for name in model.free]
+    free = tuple(name for name in model.free if name not in by_record)
+    unknowns = [model.parameter(name) for name in free]
     for record in records:
+        unknowns += [model.parameter(name) for name in by_record]
         unknowns += [_wide_enough(model.parameter(name), record) for name in free_initial]
     _check_not_all_known(model, records)
     _check_enough_samples(model, records, samples.measured, unknowns)
@@ -65,8 +69,9 @@ def problem_of(
         substeps=np.int32(grid.substeps),
         grid=grid,
         observed=observed,
-        free=model.free,
+        free=free,
         free_initial=free_initial,
+        free_by_record=tuple(by_record),
         huber=None if huber is None else number("huber", huber, _HUBER, lambda x: x > 0.0, "1.345 is usual"),
     )
 

@@ -9,13 +9,12 @@ import pytest
 
 import ehsvjax
 from ehsvjax.record_checks import checked_constants
-from tests.small_models import STIFFNESS, carriage, carriage_plant, record_of
+from tests.small_models import DAMPING, STIFFNESS, carriage, carriage_plant, record_of
 
 KEY = jax.random.key(0)
 PERIOD = 0.02
 PUSH = np.repeat(np.random.default_rng(3).uniform(-20.0, 20.0, 30), 20)
 NOISE = {"position": 2e-3}
-DAMPING = 3.0
 
 
 def recorded(stiffness: float, seed: int) -> ehsvjax.Record:

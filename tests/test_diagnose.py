@@ -98,14 +98,15 @@ OTHER_INPUT = ehsvjax.Record(TIME, {"voltage": np.sign(np.sin(TIME))}, POSITION,
     [
         ({"fit": None}, "expected a fit as identify returns it, got NoneType"),
         ({"fit": ehsvjax.van_der_pol()}, "expected a fit as identify returns it, got Model"),
-        ({"record": TIME}, "expected record to be a Record, got ndarray: make one with"),
-        ({"record": None}, "expected record to be a Record, got NoneType: make one with"),
-        ({"record": UNMEASURED}, "expected record to hold an output that was fitted, position; it has none"),
-        ({"record": OTHER_OUTPUT}, "expected record to hold an output that was fitted, position; it has speed"),
-        ({"record": MORE_OUTPUTS}, r"outputs that were fitted, position; it also has speed: drop them with \.select"),
-        ({"record": OTHER_INPUT}, "expected bench 2 to hold the inputs of .*, command; it lacks command"),
-        ({"validation": "bench"}, "expected validation to be a Record, got str: make one with"),
-        ({"validation": UNMEASURED}, "expected validation to hold an output that was fitted, position; it has none"),
+        ({"records": TIME}, "expected records to be a Record or a sequence of Records, got"),
+        ({"records": None}, "expected records to be a Record or a sequence of Records, got None: make one with"),
+        ({"records": []}, r"expected records to be a Record or a sequence of Records, got \[\]: make one with"),
+        ({"records": UNMEASURED}, "expected record to hold an output that was fitted, position; it has none"),
+        ({"records": OTHER_OUTPUT}, "expected tacho to hold an output that was fitted, position; it has speed"),
+        ({"records": MORE_OUTPUTS}, r"that were fitted, position; record also has speed: drop them with \.select"),
+        ({"records": OTHER_INPUT}, "expected bench 2 to hold the inputs of .*, command; it lacks command"),
+        ({"validation": "bench"}, "expected validation to be a Record or a sequence of Records, got 'bench': make one"),
+        ({"validation": UNMEASURED}, "expected record to hold an output that was fitted, position; it has none"),
         ({"validation": OTHER_INPUT}, "expected bench 2 to hold the inputs of .*, command; it lacks command"),
         ({"key": 0}, r"expected key to be a random key such as jax\.random\.key\(0\), got 0"),
         ({"key": None}, r"expected key to be a random key such as jax\.random\.key\(0\), got None"),
@@ -118,7 +119,7 @@ OTHER_INPUT = ehsvjax.Record(TIME, {"voltage": np.sign(np.sin(TIME))}, POSITION,
     ],
 )
 def test_what_cannot_be_diagnosed_is_refused_before_anything_is_compiled(fit, record, changes, said):
-    arguments = {"fit": fit, "record": record, "validation": None, "key": KEY, "bank": BANK} | changes
+    arguments = {"fit": fit, "records": record, "validation": None, "key": KEY, "bank": BANK} | changes
     with compilations() as compiled, pytest.raises(ValueError, match=said):
         diagnose(**arguments)
     assert compiled == []
@@ -145,7 +146,7 @@ def test_the_cause_is_named(diagnosis):
 
 def test_the_table_has_every_effect_that_the_model_can_have(diagnosis):
     kinds = {s.kind for s in ehsvjax.van_der_pol().signals} | {"parameter"}
-    possible = {e.name for e in BANK if e.kind in kinds and set(e.needs) <= {"position", "velocity"}}
+    possible = {e.name for e in BANK if e.kind in kinds and set(e.needs) <= {"position", "velocity", "time"}}
     # An input that reaches the sensor by itself bears the name of the input, which no bank knows.
     possible |= {"feedthrough_of_command"}
     assert {cause.partition("@")[0] for cause in diagnosis.table["cause"]} == possible

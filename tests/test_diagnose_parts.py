@@ -98,7 +98,7 @@ def test_whitened_noise_is_white_also_at_its_beginning():
     poles = np.array([1.0, -0.7])
     many = lfilter([1.0], poles, np.random.default_rng(3).standard_normal((4000, 220)), axis=1)[:, 200:]
     noise = ResidualNoise(0.0, np.array([0.7]), 1.0 / (1.0 - 0.49), 1.0)
-    white = whitening([noise], np.ones((1, 20, 1), bool))
+    white = whitening([[noise]], np.ones((1, 20, 1), bool))
     found = white(many[:, None, :, None])
     assert found.shape == (4000, 20)
     np.testing.assert_allclose(np.cov(found.T), np.eye(20), atol=0.1)
@@ -108,7 +108,7 @@ def test_an_output_sampled_at_every_other_step_can_be_whitened():
     measured = np.zeros((1, 100, 1), bool)
     measured[0, ::2] = True
     noise = ResidualNoise(0.0, np.array([0.0, 0.9]), 1.0 / (1.0 - 0.81), 1.0)
-    assert whitening([noise], measured).used.sum() >= 48
+    assert whitening([[noise]], measured).used.sum() >= 48
 
 
 def test_misfit_inside_the_span_is_not_taken_for_coloured_noise():
@@ -118,7 +118,7 @@ def test_misfit_inside_the_span_is_not_taken_for_coloured_noise():
     measured = np.ones(residual.shape, bool)
     found = noise_outside(residual, measured, series(misfit)[None])
     assert not found.coloured
-    assert found.noises[0].variance == pytest.approx(0.01, rel=0.15)
+    assert found.noises[0][0].variance == pytest.approx(0.01, rel=0.15)
     assert noise_outside(residual, measured, series(np.ones(1500))[None]).coloured
 
 

@@ -26,7 +26,7 @@ def bench_of(model, position, noise, **bounds):
     noisy = position + noise * np.random.default_rng(1001).standard_normal(SAMPLES)
     record = ehsvjax.Record(TIME, {"command": COMMAND}, {"position": noisy})
     fit = ehsvjax.identify(model, record, key=KEY, population=50, generations=20, bounds=bounds)
-    return workbench(fit, record, BANK)
+    return workbench(fit, [record], BANK)
 
 
 # --- Supply pressure at half of what was given ---

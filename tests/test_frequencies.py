@@ -33,7 +33,7 @@ def fit():
 
 def bench_of(fit, readings):
     record = ehsvjax.Record(PERIOD * np.arange(SAMPLES), {"command": COMMAND}, {"position": readings})
-    return workbench(fit, record, BANK)
+    return workbench(fit, [record], BANK)
 
 
 def test_parts_of_a_force_add_up_to_what_a_sine_does_to_the_plant(fit):
@@ -42,7 +42,7 @@ def test_parts_of_a_force_add_up_to_what_a_sine_does_to_the_plant(fit):
     amplitude, frequency, phase = 1e-4, 1.37, 0.4
     sine = {"force": amplitude, "frequency": frequency, "phase": phase}
     expected = position(harmonic_force=sine) - position()
-    shares = parts.means(amplitude * np.cos(frequency * PERIOD * np.arange(SAMPLES) + phase))
+    shares = parts.means(amplitude * np.cos(frequency * PERIOD * np.arange(SAMPLES) + phase)[None])
     found = shares @ parts.responses[:, 0, :, 0]
     # The parts hold a force for 0.15 s; the fit has an error of its own.
     assert np.sqrt(np.mean((found - expected) ** 2)) < 0.1 * np.sqrt(np.mean(expected**2))

@@ -58,7 +58,7 @@ def test_a_reading_within_the_error_of_a_jump_carries_no_weight(before, beside):
     outputs = {"float": time - 0.5 * edge + noise[0], "switch": (time > edge) + noise[1]}
     record = ehsvjax.Record(time, {"pump": np.ones(SAMPLES)}, outputs)
     fit = ehsvjax.identify(_switch(), record, key=jax.random.key(0), population=20, generations=10)
-    bench = workbench(fit, record, BANK)
+    bench = workbench(fit, [record], BANK)
     white = plain_noise(np.full(2, NOISE**2), bench.problem.samples.measured)
     # Where the edge is, and not where chance has put the fit.
     point = bench.nominal.copy()

@@ -31,7 +31,7 @@ def bench_of(limit: float):
     noisy = position + 0.01 * np.random.default_rng(7).standard_normal(SAMPLES)
     record = ehsvjax.Record(time, {"command": command}, {"position": noisy})
     fit = ehsvjax.identify(model, record, key=jax.random.key(0), population=50, generations=20)
-    return workbench(fit, record, BANK)
+    return workbench(fit, [record], BANK)
 
 
 @pytest.fixture(scope="module")

@@ -37,7 +37,7 @@ class Curve(NamedTuple):
         quantity: that it depends on.
         knots: `[knot]` ascending values of the quantity.
         values: `[piece, knot]` each piece there.
-        pieces: `[piece, time]` each piece along the record.
+        pieces: `[piece, record, time]` each piece along the records.
         relative: whether it is a share of the value at the place.
         periods: `[wave]` of the waves of which each could be the whole term, in the quantity's unit; none of straight
             pieces.
@@ -48,7 +48,7 @@ class Curve(NamedTuple):
     quantity: str
     knots: Float[np.ndarray, " knot"]
     values: Float[np.ndarray, "piece knot"]
-    pieces: Float[np.ndarray, "piece time"]
+    pieces: Float[np.ndarray, "piece record time"]
     relative: bool
     periods: Float[np.ndarray, " wave"]
 
@@ -60,12 +60,15 @@ class Terms(NamedTuple):
     responses: Float[np.ndarray, "piece record time signal"]
 
 
-def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
-    """Return what runs along the nominal model and varies, each once: the inputs, outputs, signals, their contexts."""
-    record_time = np.arange(bench.problem.samples.inputs.shape[1]) * float(bench.problem.samples.sample_period[0])
-    inputs = bench.problem.samples.inputs[0]
-    found = {TIME: record_time}
-    found |= {name: inputs[:, k] for k, name in enumerate(bench.fit.model.inputs)}
+def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, "record time"]]:
+    """Return what runs along the nominal model and varies, each once: the inputs, outputs, signals, their contexts.
+
+    The time runs on from record to record.
+    """
+    inputs, present = bench.problem.samples.inputs, bench.present
+    before = np.cumsum([0.0, *(present.sum(axis=1) * bench.problem.samples.sample_period)])[:-1]
+    found = {TIME: bench.clock + before[:, None]}
+    found |= {name: inputs[..., k] for k, name in enumerate(bench.fit.model.inputs)}
     # The outputs first: of two names for one motion that of the sensor is the one that people know.
     found |= {name: bench.internal.values[name] for name in bench.problem.observed if name in bench.internal.values}
     found |= dict(bench.internal.values)
@@ -74,26 +77,27 @@ def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, " time"]]:
             found.setdefault(name, series)
     kept: dict[str, np.ndarray] = {}
     for name, series in found.items():
-        if not np.all(np.isfinite(series)) or np.ptp(series) <= 1e-9 * (np.max(np.abs(series)) + 1e-300):
+        there = series[present]
+        if not np.all(np.isfinite(there)) or np.ptp(there) <= 1e-9 * (np.max(np.abs(there)) + 1e-300):
             continue
-        alike = (abs(np.corrcoef(series, other)[0, 1]) > 0.9999 for other in kept.values())
+        alike = (abs(np.corrcoef(there, other[present])[0, 1]) > 0.9999 for other in kept.values())
         if not any(alike):
             kept[name] = series
     return kept
 
 
 def terms_at(
-    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, " time"]]
+    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, "record time"]]
 ) -> Terms:
     """Return the terms of all tests, along all quantities at all places, at a point."""
     curves = _curves(bench, seen)
     return Terms(curves, curve_responses(bench, point, curves))
 
 
-def _curves(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " time"]]) -> list[Curve]:
+def _curves(bench: Workbench, seen: Mapping[str, Float[np.ndarray, "record time"]]) -> list[Curve]:
     places = (*bench.places, *bench.problem.observed)
     coarse = [straight_along(bench, place, quantity, seen, _COARSE) for place in places for quantity in seen]
-    waves = min(_WAVES, bench.problem.samples.outputs.shape[1] // _SAMPLES_PER_WAVE)
+    waves = min(_WAVES, int(bench.present.sum()) // _SAMPLES_PER_WAVE)
     if waves <= _FOLLOWED:
         return coarse
     outputs = [name for name in bench.problem.observed if name in seen]
@@ -101,33 +105,35 @@ def _curves(bench: Workbench, seen: Mapping[str, Float[np.ndarray, " time"]]) ->
 
 
 def straight_along(
-    bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, " time"]], pieces: int
+    bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, "record time"]], pieces: int
 ) -> Curve:
     """Return the curve of so many straight pieces along a quantity at a place."""
-    knots = knots_along(seen[quantity], pieces)
+    knots = knots_along(seen[quantity][bench.present], pieces)
     values = np.eye(len(knots))
     hats = np.stack([np.interp(seen[quantity], knots, value) for value in values])
     return Curve(place, quantity, knots, values, hats, _is_opening(bench, place), np.zeros(0))
 
 
 def wave_along(
-    bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, " time"]], period: float
+    bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, "record time"]], period: float
 ) -> Curve:
     """Return the curve that repeats with a period of a quantity, in two phases."""
     series = seen[quantity]
-    number = np.ptp(series) / period
-    knots = np.linspace(series.min(), series.max(), int(number * _KNOTS_PER_WAVE) + 2)
+    there = series[bench.present]
+    number = np.ptp(there) / period
+    knots = np.linspace(there.min(), there.max(), int(number * _KNOTS_PER_WAVE) + 2)
     return Curve(
-        place, quantity, knots, _phases(_share(knots, series), number), _phases(_share(series, series), number),
+        place, quantity, knots, _phases(_share(knots, there), number), _phases(_share(series, there), number),
         _is_opening(bench, place), np.array([period]),
     )  # fmt: skip
 
 
 def _waves_along(bench, place, quantity, series, waves) -> Curve:
     """Return the curve of all waves of which there are at most so many in the range, in steps of half a wave."""
-    knots = np.linspace(series.min(), series.max(), waves * _KNOTS_PER_WAVE)
-    values, pieces = (_all_waves(_share(along, series), waves) for along in (knots, series))
-    periods = np.ptp(series) / _wave_numbers(waves)
+    there = series[bench.present]
+    knots = np.linspace(there.min(), there.max(), waves * _KNOTS_PER_WAVE)
+    values, pieces = (_all_waves(_share(along, there), waves) for along in (knots, series))
+    periods = np.ptp(there) / _wave_numbers(waves)
     return Curve(place, quantity, knots, values, pieces, _is_opening(bench, place), periods)
 
 
@@ -135,13 +141,13 @@ def _share(along, series):
     return (along - series.min()) / np.ptp(series)
 
 
-def _phases(share, number) -> Float[np.ndarray, "phase point"]:
+def _phases(share, number) -> Float[np.ndarray, "phase ..."]:
     return np.stack([np.cos(2.0 * np.pi * number * share), np.sin(2.0 * np.pi * number * share)])
 
 
-def _all_waves(share, waves) -> Float[np.ndarray, "piece point"]:
+def _all_waves(share, waves) -> Float[np.ndarray, "piece ..."]:
     numbers = np.arange(1, 2 * waves + 1) / 2.0
-    return np.concatenate([np.ones((1, len(share))), *(_phases(share, number) for number in numbers)])
+    return np.concatenate([np.ones((1, *share.shape)), *(_phases(share, number) for number in numbers)])
 
 
 def waves_in(curve: Curve) -> int:
@@ -169,7 +175,7 @@ def _is_opening(bench: Workbench, place: str) -> bool:
     return any(s.name == place and s.kind == "opening" for s in bench.fit.model.signals)
 
 
-def knots_along(series: Float[np.ndarray, " time"], pieces: int) -> Float[np.ndarray, " knot"]:
+def knots_along(series: Float[np.ndarray, " sample"], pieces: int) -> Float[np.ndarray, " knot"]:
     """Return ascending knots, at most so many, with as many samples between each two, over the range of a series."""
     quantiles = np.quantile(series, np.linspace(0.0, 1.0, pieces))
     knots = [quantiles[0]]
@@ -197,7 +203,7 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
     row = 1
     for curve in inside:
         acting = _acting(bench, curve, curve.pieces)
-        added[row : row + len(curve.pieces), 0, :, bench.places.index(curve.place)] = acting
+        added[row : row + len(curve.pieces), ..., bench.places.index(curve.place)] = acting
         row += len(curve.pieces)
     outputs = bench.sketched(np.repeat(point[None], len(added), axis=0), added) if inside else None
     changes, row = [], 1
@@ -208,7 +214,7 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
             row += len(curve.pieces)
         else:
             sensed = np.zeros((len(curve.pieces), *samples.outputs.shape))
-            sensed[:, 0, :, bench.problem.observed.index(curve.place)] = _acting(bench, curve, curve.pieces)
+            sensed[..., bench.problem.observed.index(curve.place)] = _acting(bench, curve, curve.pieces)
             changes.append(sensed)
     return np.concatenate(changes)
 
@@ -216,32 +222,39 @@ def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[n
 def outputs_with(bench: Workbench, points, coefficients, curve: Curve):
     """Return the outputs of points with a curve acting at its place."""
     shape = bench.problem.samples.outputs.shape
-    acting = _acting(bench, curve, coefficients @ curve.pieces)
+    acting = _acting(bench, curve, along_records(curve, coefficients))
     if curve.place not in bench.places:
         outputs = bench.simulated(points)
-        outputs[:, 0, :, bench.problem.observed.index(curve.place)] += acting
+        outputs[..., bench.problem.observed.index(curve.place)] += acting
         return outputs
     added = np.zeros((len(points), *shape[:2], len(bench.places)))
-    added[:, 0, :, bench.places.index(curve.place)] = acting
+    added[..., bench.places.index(curve.place)] = acting
     return bench.simulated(points, added)
 
 
 def bench_with(bench: Workbench, curve: Curve, coefficients: Float[np.ndarray, " piece"]) -> Workbench:
     """Return the workbench with a curve that always acts at its place."""
-    acting = _acting(bench, curve, coefficients @ curve.pieces)
+    acting = _acting(bench, curve, along_records(curve, coefficients))
     if curve.place in bench.places:
         disturbances = bench.disturbances.copy()
-        disturbances[0, :, bench.places.index(curve.place)] += acting
+        disturbances[..., bench.places.index(curve.place)] += acting
         return replace(bench, disturbances=disturbances)
     # What a sensor adds may as well be taken from its readings.
     samples = bench.problem.samples
     readings = samples.outputs.copy()
-    readings[0, :, bench.problem.observed.index(curve.place)] -= acting
+    readings[..., bench.problem.observed.index(curve.place)] -= acting
     return replace(bench, problem=replace(bench.problem, samples=samples._replace(outputs=readings)))
 
 
-def _acting(bench: Workbench, curve: Curve, probes: Float[np.ndarray, "*batch time"]):
-    """Return what a curve adds to the value at its place, from its probes along the record."""
+def along_records(
+    curve: Curve, coefficients: Float[np.ndarray, "*batch piece"]
+) -> Float[np.ndarray, "*batch record time"]:
+    """Return a curve of these coefficients along the records, in probes."""
+    return np.tensordot(coefficients, curve.pieces, 1)
+
+
+def _acting(bench: Workbench, curve: Curve, probes: Float[np.ndarray, "*batch record time"]):
+    """Return what a curve adds to the value at its place, from its probes along the records."""
     size = bench.internal.values[curve.place] if curve.relative else 1.0
     return probe_at(bench, curve.place) * probes * size
 

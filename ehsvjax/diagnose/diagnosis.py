@@ -37,7 +37,7 @@ class Excluded(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """What a fitted model gets wrong on a record, and why. Made by `diagnose`; print it.
+    """What a fitted model gets wrong on records, and why. Made by `diagnose`; print it.
 
     Attributes:
         verdict: "adequate", "named", "ambiguous" or "unexplained".
@@ -56,7 +56,7 @@ class Diagnosis:
         process_noise: the random force that was found, if it is the cause.
         integration: the step that was needed, and what its arithmetic is worth.
         fit: the fit that was diagnosed.
-        record: on which.
+        records: on which.
 
     """
 
@@ -74,7 +74,12 @@ class Diagnosis:
     process_noise: ProcessNoise | None
     integration: Integration
     fit: Fit
-    record: Record
+    records: tuple[Record, ...]
+
+    @property
+    def record(self) -> Record:
+        """The first of the records."""
+        return self.records[0]
 
     def __str__(self) -> str:
         """Return the diagnosis in a few sentences."""

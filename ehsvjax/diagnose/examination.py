@@ -104,12 +104,11 @@ def _random_force(
     explains it about as well as a single cause.
     """
     bench = selection.bench
-    used = selection.white.used
-    nominal = process_noise(bench, selection.nominal, used)
+    nominal = process_noise(bench, selection.nominal, selection.white)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
         return None, False
     if selection.included:
-        final = process_noise(bench, selection.final, used)
+        final = process_noise(bench, selection.final, selection.white)
         assert final is not None
         better = nominal.likelihood - final.of_sensor + _least_price(selection)
         # A single cause that leaves nothing unexplained has the first word.

@@ -7,51 +7,59 @@ import numpy as np
 from ehsvjax.diagnose.noise import plain_noise
 from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.selection import Selection
+from ehsvjax.diagnose.workbench import duration_of
 from ehsvjax.doubts import about_arithmetic
 from ehsvjax.effects.effect import UNLIMITED
 from ehsvjax.effects.extended import extended
 from ehsvjax.fit import Effort, Fit, History, at_bound
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import to_values
-from ehsvjax.record import Record
 
 # Bounds of an effect's number that has none: this many times its value.
 _REACH = 10.0
 
 
-def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], record: Record) -> Fit:
+def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> Fit:
     """Return a refit as an ordinary fit by least squares, which weights no correlation, as `identify` fits.
+
+    What an effect of the run does in each of several records is known of that record, and absent in any other.
 
     Args:
         selection: what was found.
         refits: one refit.
         included: positions of the effects that it includes; none for the nominal model.
-        record: that it was refitted to.
 
     """
     bench = selection.bench
+    records = bench.records
     refits = _unweighted(selection, refits, included)
     values = dict(zip(bench.column, to_values(bench.problem.coordinates, refits.points[0]), strict=True))
-    known = {n: v[0] for n, v in bench.problem.known_initial.items()}
-    initial = {p.name: float((values | known)[p.name]) for p in bench.fit.model.initial}
+    values |= {f"{n}[{k}]": v for n, known in bench.problem.known_initial.items() for k, v in enumerate(known)}
+    initial = [{p.name: float(values[f"{p.name}[{k}]"]) for p in bench.fit.model.initial} for k in range(len(records))]
     # In the order of the bank, in which they act one after another at a signal.
     attached = tuple(bench.candidates[i] for i in sorted(included))
-    numbers = {}
+    numbers: dict[str, Parameter] = {}
+    of_run: list[dict[str, float]] = [{} for _ in records]
     for candidate in attached:
         scales = bench.scales[candidate.name]
-        for number in candidate.effect.parameters:
-            name = candidate.parameter(number.name)
-            value = float(values[name])
+        for number, column in bench.unknowns_of(candidate):
+            name, named = candidate.parameter(number.name), bench.problem.names[column]
+            value = float(values[named])
             lower, upper = number.lower(scales), number.upper(scales)
-            reach = _REACH * abs(value) or bench.problem.coordinates.upper[bench.column[name]]
+            reach = _REACH * abs(value) or bench.problem.coordinates.upper[column]
             lower = -reach if lower <= -UNLIMITED else min(lower, value)
             upper = reach if upper >= UNLIMITED else max(upper, value)
             numbers[name] = Parameter(name, name, bench.model.parameter(name).unit, value, lower, upper)
+            if named != name:
+                assert number.absent is not None
+                numbers[name] = numbers[name]._replace(value=number.absent, fixed=True)
+                next(own for own in of_run if name not in own)[name] = value
     model = bench.fit.model
     if attached:
-        model = extended(model, attached, numbers, len(record) * record.sample_period)
+        model = extended(model, attached, numbers, duration_of(records))
+    step_size = min(record.sample_period for record in records) / int(bench.problem.substeps)
     if bench.problem.substeps > bench.problem.grid.substeps:
-        model = replace(model, max_step=record.sample_period / int(bench.problem.substeps))
+        model = replace(model, max_step=step_size)
     parameters = {name: float(values[name]) for name in model.free}
     # Nothing was searched: it was refined from the fit that was diagnosed, by squares, spikes left out.
     effort = Effort(
@@ -66,15 +74,15 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...], reco
         converged=bool(refits.converged[0]),
         remaining=float("nan"),
         arithmetic=selection.integration.worth,
-        step_size=record.sample_period / int(bench.problem.substeps),
+        step_size=step_size,
         left_out=sum(selection.integration.left_out.values()),
     )
     return replace(
         bench.fit,
         model=model,
-        records=(record,),
+        records=tuple(record.at(**own) if own else record for record, own in zip(records, of_run, strict=True)),
         parameters=parameters,
-        initial=(initial,),
+        initial=tuple(initial),
         noise_variance=_variances(selection, refits),
         effort=effort,
         history=History(*(np.zeros(0),) * 4, best={}),

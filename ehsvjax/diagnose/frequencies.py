@@ -34,8 +34,7 @@ def parts_of(bench: Workbench) -> dict[str, Parts]:
 
 def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts: Mapping[str, Parts]) -> Workbench:
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
-    period = float(bench.problem.samples.sample_period[0])
-    duration = len(current.residual[0, 0]) * period
+    duration = float(np.max(bench.present.sum(axis=1) * bench.problem.samples.sample_period))
     known, r = unexplained(current, white)
     scales: dict[str, Scales] = {}
     for candidate in bench.candidates:
@@ -51,7 +50,8 @@ def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts:
             frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration)
             peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, white, known, r, there))
             lowest = edge
-        peaks += _peaks(*_periodogram(bench, current, lowest, highest))
+        for k in range(len(bench.records)):
+            peaks += _peaks(*_periodogram(bench, current, k, lowest, highest))
         scales[candidate.name] = {**own, "frequencies": _strongest(peaks, duration) or own["frequencies"]}
     return replace(bench, scales={**bench.scales, **scales})
 
@@ -81,16 +81,14 @@ def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
     amplitudes = [n for n in numbers if n.absent is not None]
     absent = {n.name: n.absent if n.absent is not None else n.tries(scales)[0] for n in numbers}
     internal = bench.internal
-    period = float(bench.problem.samples.sample_period[0])
-    time = np.arange(len(parts.of_sample)) * period
-    context = {**internal.contexts[candidate.signal], "time": time}
-    always = {"step_size": period, "duration": len(time) * period}
+    context = {**internal.contexts[candidate.signal], "time": bench.clock}
+    always = {"step_size": float(np.min(bench.problem.samples.sample_period)), "duration": scales["duration"]}
 
     def added(own, value, along):
         return candidate.effect.apply(own, value, along | always) - value
 
     with jax.enable_x64(True):
-        every_time = jax.vmap(added, in_axes=(None, 0, 0))
+        every_time = jax.vmap(jax.vmap(added, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
         every = jax.vmap(
             every_time, in_axes=({n.name: 0 if n.name == "frequency" else None for n in numbers}, None, None)
         )
@@ -102,16 +100,20 @@ def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
             )
             for n in amplitudes
         ]
-        return np.stack([parts.means(np.asarray(row)) for row in rows], axis=1)
+        means = [parts.means(np.asarray(row)) for row in rows]
+    # Each record has amplitudes of its own.
+    own = parts.of_record == np.arange(len(bench.records))[:, None]
+    return np.stack([mean * inside for mean in means for inside in own], axis=1)
 
 
-def _periodogram(bench: Workbench, current: Refits, lowest: float, highest: float):
-    """Return frequencies between two, rad/s, and how strong the first output's residual is there."""
-    measured = bench.problem.samples.measured[0, :, 0]
-    residual = np.where(measured, current.residual[0, 0, :, 0], 0.0)
+def _periodogram(bench: Workbench, current: Refits, record: int, lowest: float, highest: float):
+    """Return frequencies between two, rad/s, and how strong a record's residual of the first output is there."""
+    present = bench.present[record]
+    measured = bench.problem.samples.measured[record, present, 0]
+    residual = np.where(measured, current.residual[0, record, present, 0], 0.0)
     size = 8 * len(residual)
     power = np.abs(np.fft.rfft((residual - residual.mean()) * np.hanning(len(residual)), size)) ** 2
-    frequency = 2.0 * np.pi * np.fft.rfftfreq(size, float(bench.problem.samples.sample_period[0]))
+    frequency = 2.0 * np.pi * np.fft.rfftfreq(size, float(bench.problem.samples.sample_period[record]))
     inside = (frequency > lowest) & (frequency < highest)
     # Of a sine in white noise this is the score of its two amplitudes.
     deviation = np.sqrt(max(float(np.var(residual[measured])), 1e-300))

@@ -1,12 +1,13 @@
 """What an extended model gains on data that it was not fitted to."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import padded, refit
+from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.selection import Selection
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
@@ -39,59 +40,136 @@ class OutputGain(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """Of all outputs, by name; `on` says on which data."""
+    """What is gained on data that were not used.
+
+    Attributes:
+        outputs: of each output, all records together.
+        by_record: the same of each record, in their order.
+        records: their names.
+        on: says on which data.
+
+    """
 
     outputs: dict[str, OutputGain]
+    by_record: tuple[dict[str, OutputGain], ...]
+    records: tuple[str, ...]
     on: str
+
+
+class _Judged(NamedTuple):
+    """One record, or a part of it, that was not used, by output: residuals before and after, readings, the noise."""
+
+    before: dict[str, Float[np.ndarray, " time"]]
+    after: dict[str, Float[np.ndarray, " time"]]
+    readings: dict[str, Float[np.ndarray, " time"]]
+    noise_variance: dict[str, float]
 
 
 def gain_of(
     selection: Selection,
     nominal: Fit,
     extended: Fit,
-    validation: Record | None,
+    validation: Sequence[Record],
     rng: np.random.Generator,
 ) -> Gain:
-    """Return the gain on a validation record, or on the last part of the record, held back from both refits."""
-    if validation is None:
-        before, after, measured, on = _held_back(selection)
+    """Return the gain on validation records; without any, on each record, predicted from the others or its own past."""
+    records = validation or selection.bench.records
+    names = tuple(record.name for record in records)
+    if validation:
+        judged = [_validated(selection, nominal, extended, record) for record in validation]
+        on = f"{', '.join(names)}, which {'was' if len(names) == 1 else 'were'} not used"
+    elif len(records) > 1:
+        judged = [_left_out(selection, k) for k in range(len(records))]
+        on = "each record, predicted from the others"
     else:
-        names = [n for n in selection.bench.problem.observed if n in validation.outputs]
-        # What was not fitted has no noise by which its initial conditions could be weighed.
-        judged = validation.select(outputs=names)
-        residuals = [fit.residuals(judged) for fit in (nominal, extended)]
-        before, after = ({n: r[n] for n in names} for r in residuals)
-        measured = {n: validation.outputs[n] for n in names}
-        on = f"{validation.name}, which was not used"
-    noises = dict(zip(selection.bench.problem.observed, selection.white.noises, strict=True))
-    return Gain(
-        {n: _gain(before[n], after[n], measured[n], noises[n].variance, rng) for n in before}, on
-    )  # fmt: skip
+        judged, on = [_held_back(selection)], f"the last {_HELD_BACK:.0%} of the record, which was held back"
+    return Gain(_gains([_together(judged)], rng)[0], tuple(_gains(judged, rng)), names, on)
 
 
-def _held_back(selection: Selection):
-    """Return residuals before and after, and readings, of the last part; both models refitted to the first alone."""
+def _gains(judged: Sequence[_Judged], rng) -> list[dict[str, OutputGain]]:
+    return [
+        {n: _gain(one.before[n], one.after[n], one.readings[n], one.noise_variance[n], rng) for n in one.before}
+        for one in judged
+    ]
+
+
+def _together(judged: Sequence[_Judged]) -> _Judged:
+    """Return all that is judged, one after the other; of the noise the mean by readings."""
+    names = dict.fromkeys(name for one in judged for name in one.before)
+
+    def joined(field):
+        return {n: np.concatenate([getattr(one, field)[n] for one in judged if n in one.before]) for n in names}
+
+    def mean_variance(name):
+        there = [one for one in judged if name in one.before]
+        counts = [max(int(np.isfinite(one.readings[name]).sum()), 1) for one in there]
+        return float(np.average([one.noise_variance[name] for one in there], weights=counts))
+
+    return _Judged(joined("before"), joined("after"), joined("readings"), {n: mean_variance(n) for n in names})
+
+
+def _validated(selection: Selection, nominal: Fit, extended: Fit, record: Record) -> _Judged:
+    """Return what both models make of a record that they have not seen."""
     bench = selection.bench
-    samples = bench.problem.samples
-    counted = np.cumsum(samples.measured[0].sum(axis=-1))
+    names = [n for n in bench.problem.observed if n in record.outputs]
+    # What was not fitted has no noise by which its initial conditions could be weighed.
+    judged = record.select(outputs=names)
+    before, after = (fit.residuals(judged) for fit in (nominal, extended))
+    # The noise of a record of which nothing is known: the mean of those that are.
+    variances = {n: selection.white.variance_of(bench.problem.observed.index(n)) for n in names}
+    return _Judged(
+        {n: before[n] for n in names}, {n: after[n] for n in names}, {n: record.outputs[n] for n in names}, variances
+    )
+
+
+def _held_back(selection: Selection) -> _Judged:
+    """Return the last part of a single record; both models are refitted to the first alone."""
+    measured = selection.bench.problem.samples.measured
+    counted = np.cumsum(measured[0].sum(axis=-1))
     cut = int(np.searchsorted(counted, (1.0 - _HELD_BACK) * counted[-1]))
     used = selection.white.used.copy()
     used[:, cut:] = False
+    return _judged(selection, _both_refitted(selection, used).residual, 0, slice(cut, None))
+
+
+def _left_out(selection: Selection, record: int) -> _Judged:
+    """Return one of several records; both models are refitted to the others, and start in it as it says itself."""
+    bench = selection.bench
+    used = selection.white.used.copy()
+    used[record] = False
+    others = _both_refitted(selection, used)
+    points, names = others.points.copy(), bench.problem.names
+    of_record = [j for j, name in enumerate(names) if name.endswith(f"[{record}]")]
+    initial = [j for j in of_record if j in bench.base_columns]
+    # What is of a run no other record tells.
+    points[:, of_record] = np.where(np.isin(of_record, initial), points[:, of_record], bench.nominal[of_record])
+    own = selection.white._replace(used=selection.white.used & ~used)
+    width = max(len(initial), 1)
+    started = refit(bench, points, padded([initial] * len(points), width), own, race=False)
+    return _judged(selection, started.residual, record, slice(None))
+
+
+def _both_refitted(selection: Selection, used: Bool[np.ndarray, "record time signal"]) -> Refits:
+    """Return the refits of the nominal and of the extended model to some of the readings."""
+    bench = selection.bench
     white = Whitening(selection.white.noises, used)
-    width = selection.final.chosen.shape[1]
     sets = [bench.columns_with(()), bench.columns_with(selection.included)]
     starts = np.stack([selection.nominal.points[0], selection.final.points[0]])
-    refitted = refit(bench, starts, padded(sets, width), white, race=False)
-    kept = np.where(samples.measured, 1.0, np.nan)[0, cut:]
-    before, after = (refitted.residual[k, 0, cut:] * kept for k in (0, 1))
-    readings = samples.outputs[0, cut:] * kept
-    names = bench.problem.observed
-    return (
-        {n: before[:, i] for i, n in enumerate(names)},
-        {n: after[:, i] for i, n in enumerate(names)},
-        {n: readings[:, i] for i, n in enumerate(names)},
-        f"the last {_HELD_BACK:.0%} of the record, which was held back",
-    )
+    return refit(bench, starts, padded(sets, selection.final.chosen.shape[1]), white, race=False)
+
+
+def _judged(selection: Selection, residual, record: int, part: slice) -> _Judged:
+    """Return a part of a record, from the residuals `[model, record, time, signal]` of both models."""
+    bench, noises = selection.bench, selection.white.noises[record]
+    samples = bench.problem.samples
+    kept = np.where(samples.measured[record], 1.0, np.nan)[part]
+    before, after = (residual[k, record, part] * kept for k in (0, 1))
+    readings = samples.outputs[record, part] * kept
+    there = [(i, n) for i, n in enumerate(bench.problem.observed) if n in bench.records[record].outputs]
+    return _Judged(
+        {n: before[:, i] for i, n in there}, {n: after[:, i] for i, n in there}, {n: readings[:, i] for i, n in there},
+        {n: noises[i].variance for i, n in there},
+    )  # fmt: skip
 
 
 def _gain(before, after, readings, noise_variance, rng) -> OutputGain:

@@ -46,10 +46,9 @@ def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbe
     points[1:, moved] = np.clip(point[moved] + np.concatenate([errors.T, -errors.T]), lower[moved], upper[moved])
     outputs = bench.simulated(points)
     forward, backward = np.split(outputs[1:], 2)
-    bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0)
-    apart = _STRAIGHT * np.sqrt(white.variances)
+    bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0) / np.sqrt(white.variances)[:, None, :]
     # More than the others: the first reading of a bend that begins bends less.
-    alone = [standing_out(bent[..., i], limit) for i, limit in enumerate(apart)]
+    alone = [standing_out(bent[..., i], _STRAIGHT) for i in range(bent.shape[-1])]
     jumping = samples.measured & np.stack(alone, axis=-1)
     # More than that no jump bends.
     if not jumping.any() or not few(jumping, samples.measured, LEFT_OUT):

@@ -35,7 +35,8 @@ class OutputMisfit(NamedTuple):
     """Of one output.
 
     Attributes:
-        rmse: of the model refitted to the record, in its unit.
+        rmse: of the model refitted to the records, in its unit.
+        rmse_predicted: of the fit with its parameters as they stood, in its unit.
         noise_floor: standard deviation of the noise, in its unit.
         above_noise: share of the residual's sum of squares that is not noise.
         residual: `[time]` measured minus simulated; NaN where nothing is measured.
@@ -50,6 +51,7 @@ class OutputMisfit(NamedTuple):
     """
 
     rmse: float
+    rmse_predicted: float
     noise_floor: float
     above_noise: float
     residual: Float[np.ndarray, " time"]
@@ -66,45 +68,73 @@ class Misfit(NamedTuple):
     """What the nominal model gets wrong.
 
     Attributes:
-        outputs: by name.
+        by_record: the outputs by name, of each record in turn.
         tests: whether the residual depends on something, the most significant first.
         tests_after: the same of what the extended model leaves.
 
     """
 
-    outputs: dict[str, OutputMisfit]
+    by_record: tuple[dict[str, OutputMisfit], ...]
     tests: tuple[Dependence, ...]
     tests_after: tuple[Dependence, ...]
+
+    @property
+    def outputs(self) -> dict[str, OutputMisfit]:
+        """Of the first record, by name."""
+        return self.by_record[0]
 
 
 def misfit_of(examined: Examination, outliers: Bool[np.ndarray, "record time signal"]) -> Misfit:
     """Return what the nominal model gets wrong, judged by the noise that the whole diagnosis counts on."""
+    bench = examined.selection.bench
+    predicted = bench.problem.samples.outputs - bench.simulated(bench.nominal[None])[0]
+    return Misfit(
+        tuple(_of_record(examined, predicted[k], outliers[k], k) for k in range(len(bench.records))),
+        examined.before,
+        examined.after,
+    )
+
+
+def _of_record(
+    examined: Examination,
+    predicted: Float[np.ndarray, "time signal"],
+    outliers: Bool[np.ndarray, "time signal"],
+    record: int,
+) -> dict[str, OutputMisfit]:
+    """Return what is wrong in one record; `predicted` is what the fit left of it as it stood."""
     selection = examined.selection
     bench = selection.bench
-    samples = bench.problem.samples
+    samples, present = bench.problem.samples, bench.present[record]
     outputs = {}
     for i, name in enumerate(bench.problem.observed):
-        measured = samples.measured[0, :, i]
-        residual = np.where(measured, selection.nominal.residual[0, 0, :, i], np.nan)
-        noise = selection.white.noises[i]
+        if name not in bench.records[record].outputs:
+            continue
+        measured = samples.measured[record, present, i]
+        residual = np.where(measured, selection.nominal.residual[0, record, present, i], np.nan)
+        noise = selection.white.noises[record][i]
         found = residual_noise(
             np.nan_to_num(residual)[None] / np.nanstd(residual), measured[None], "white"
         )  # fmt: skip
         square = float(np.nanmean(residual**2))
         outputs[name] = OutputMisfit(
             rmse=square**0.5,
+            rmse_predicted=float(np.mean(predicted[present, i][measured] ** 2)) ** 0.5,
             noise_floor=noise.variance**0.5,
             above_noise=float(np.clip(1.0 - noise.variance / square, 0.0, 1.0)),
             residual=residual,
             in_time=_in_time(residual) / noise.variance**0.5,
-            in_frequency=_in_frequency(residual, noise, float(samples.sample_period[0])),
-            against={q: _against(residual, series, noise) for q, series in selection.seen.items()},
+            in_frequency=_in_frequency(residual, noise, float(samples.sample_period[record])),
+            against={
+                quantity: _against(residual, series[record, present], noise)
+                for quantity, series in selection.seen.items()
+                if np.ptp(series[record, present]) > 0
+            },
             whiteness=found.p_value,
             coloured=bool(len(noise.coefficients)),
-            outliers=outliers[0, :, i],
-            lattice=lattice(samples.outputs[0, :, i][measured]),
+            outliers=outliers[present, i],
+            lattice=lattice(samples.outputs[record, present, i][measured]),
         )
-    return Misfit(outputs, examined.before, examined.after)
+    return outputs
 
 
 def _in_time(residual) -> Float[np.ndarray, " window"]:

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ehsvjax.diagnose.curves import (
     TIME,
     Curve,
+    along_records,
     bench_with,
     outputs_with,
     probe_at,
@@ -56,7 +57,7 @@ class MissingTerm(NamedTuple):
         at: `[knot]` values of the quantity.
         estimate: `[knot]` what is missing there, in the unit of the place.
         deviation: `[knot]` standard deviation of the estimate.
-        series: `[time]` the term along the record.
+        series: `[time]` the term along the records, one after the other.
         relative: whether the estimate is a share of the value at the place.
         period: in the quantity's unit, if the term is a single wave along it; else None.
         explained: share of the residual's sum of squares above the noise that it takes.
@@ -86,7 +87,7 @@ def missing_term(
     bench: Workbench,
     final: Refits,
     white: Whitening,
-    seen: Mapping[str, Float[np.ndarray, " time"]],
+    seen: Mapping[str, Float[np.ndarray, "record time"]],
     suspects: Sequence[Dependence],
 ) -> MissingTerm:
     """Estimate the term that takes most of what is left, at the place and along the quantity that explain most.
@@ -127,7 +128,8 @@ def missing_term(
     place, quantity = curve[:2]
     probe = probe_at(bench, place)
     free = best.settled.free
-    coefficients = smooth.coefficients + _least(smooth.coefficients @ curve.pieces, free @ curve.pieces) @ free
+    term, lines = (along_records(curve, of)[..., bench.present] for of in (smooth.coefficients, free))
+    coefficients = smooth.coefficients + _least(term, lines) @ free
     variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - left - smooth.pieces
@@ -139,7 +141,7 @@ def missing_term(
         at=curve.knots,
         estimate=probe * coefficients @ curve.values,
         deviation=probe * np.sqrt(variances),
-        series=probe * coefficients @ curve.pieces,
+        series=probe * along_records(curve, coefficients)[bench.present],
         relative=curve.relative,
         period=float(curve.periods[0]) if len(curve.periods) else None,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
@@ -151,7 +153,7 @@ def missing_term(
 
 def likelihood(left: float, count: int, white: Whitening) -> float:
     """Return twice the logarithm of the likelihood of whitened residuals with this sum of squares, at its best."""
-    return -float(count * np.log(white.noises[0].innovation_variance * left / count)) - count
+    return -white.log_units - float(count * np.log(left / count)) - count
 
 
 def _least(term, free) -> Float[np.ndarray, " line"]:

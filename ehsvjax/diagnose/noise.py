@@ -1,4 +1,4 @@
-"""The noise of a record that a model does not explain yet: spikes, lattices, and correlated noise told from misfit.
+"""The noise of records that a model does not explain yet: spikes, lattices, and correlated noise told from misfit.
 
 A residual is noise and misfit together. What candidate causes could have done lies in the space of their responses, so
 that noise is judged by what is left of the residual outside that space: a model's misfit is then not taken for coloured
@@ -25,15 +25,15 @@ _SPIKE = 4.0
 
 
 class Whitening(NamedTuple):
-    """Makes noise white and of variance one: the innovations of an autoregression of each output.
+    """Makes noise white and of variance one: the innovations of an autoregression of each output in each record.
 
     Attributes:
-        noises: of each output, in its unit.
+        noises: `[record][signal]` of each output, in its unit.
         used: `[record, time, signal]` samples whose innovation can be computed.
 
     """
 
-    noises: tuple[ResidualNoise, ...]
+    noises: tuple[tuple[ResidualNoise, ...], ...]
     used: Bool[np.ndarray, "record time signal"]
 
     def __call__(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
@@ -41,25 +41,35 @@ class Whitening(NamedTuple):
         from scipy.signal import lfilter  # slow to import
 
         parts = []
-        for i, noise in enumerate(self.noises):
-            whitened = series[..., i]
+        for i, k in np.ndindex(self.used.shape[-1], self.used.shape[0]):
+            noise, whitened = self.noises[k][i], series[..., k, :, i]
             order = len(noise.coefficients)
             if order:
                 first = whitened[..., :order] @ _first_innovations(noise).T
                 whitened = lfilter(np.concatenate([[1.0], -noise.coefficients]), 1.0, whitened, axis=-1)
                 whitened[..., :order] = first
-            parts.append(whitened[..., self.used[..., i]] / np.sqrt(noise.innovation_variance))
+            parts.append(whitened[..., self.used[k, :, i]] / np.sqrt(noise.innovation_variance))
         return np.concatenate(parts, axis=-1)
 
     @property
-    def variances(self) -> Float[np.ndarray, " signal"]:
+    def variances(self) -> Float[np.ndarray, "record signal"]:
         """Of the innovations of each output, in its unit squared: of what a sample tells alone."""
-        return np.array([noise.innovation_variance for noise in self.noises])
+        return np.array([[noise.innovation_variance for noise in of_record] for of_record in self.noises])
+
+    def variance_of(self, signal: int) -> float:
+        """Return the variance of one output's noise, the mean over the records."""
+        counts = self.used[..., signal].sum(axis=1)
+        return float(np.average([noises[signal].variance for noises in self.noises], weights=np.maximum(counts, 1e-9)))
+
+    @property
+    def log_units(self) -> float:
+        """Sum of the logarithms of these variances over the samples: what likelihoods of whitened ones leave out."""
+        return float(np.sum(self.used.sum(axis=1) * np.log(self.variances)))
 
     @property
     def coloured(self) -> bool:
         """Whether any output's noise is correlated."""
-        return any(len(noise.coefficients) for noise in self.noises)
+        return any(len(noise.coefficients) for of_record in self.noises for noise in of_record)
 
 
 def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample"]:
@@ -71,22 +81,34 @@ def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample
     return np.sqrt(noise.innovation_variance) * np.linalg.inv(root)
 
 
-def whitening(noises: Sequence[ResidualNoise], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
+def whitening(noises: Sequence[Sequence[ResidualNoise]], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
     """Return the whitening of noises for what is measured: a sample needs those before it."""
     used = measured.copy()
-    for i, noise in enumerate(noises):
-        order = len(noise.coefficients)
+    for k, i in np.ndindex(*_channels(measured)):
+        coefficients = noises[k][i].coefficients
+        order = len(coefficients)
         for lag in range(1, order + 1):
-            if noise.coefficients[lag - 1] != 0.0:
-                used[:, lag:, i] &= measured[:, :-lag, i]
+            if coefficients[lag - 1] != 0.0:
+                used[k, lag:, i] &= measured[k, :-lag, i]
         # The first samples are made white together.
-        used[:, :order, i] &= measured[:, :order, i].all(axis=1, keepdims=True)
-    return Whitening(tuple(noises), used)
+        used[k, :order, i] &= measured[k, :order, i].all()
+    return Whitening(tuple(map(tuple, noises)), used)
 
 
-def plain_noise(variances: Float[np.ndarray, " signal"], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
+def plain_noise(
+    variances: Float[np.ndarray, "*record signal"], measured: Bool[np.ndarray, "record time signal"]
+) -> Whitening:
     """Return white noise of these variances, in the outputs' units squared: least squares as `identify` does them."""
-    return whitening([ResidualNoise(float("nan"), np.zeros(0), float(v), float(v)) for v in variances], measured)
+    return whitening([[_white(v) for v in row] for row in np.broadcast_to(variances, _channels(measured))], measured)
+
+
+def _white(variance: float) -> ResidualNoise:
+    return ResidualNoise(float("nan"), np.zeros(0), float(variance), float(variance))
+
+
+def _channels(measured) -> tuple[int, int]:
+    """Return the numbers of records and of signals."""
+    return measured.shape[0], measured.shape[-1]
 
 
 def noise_outside(
@@ -102,32 +124,44 @@ def noise_outside(
         responses: of all that may have acted: the model's sensitivities, the candidates' responses.
 
     """
-    deviation = np.array([_deviation(residual[..., i][measured[..., i]]) for i in range(residual.shape[-1])])
+    records, signals = _channels(measured)
+    # An output that a record does not hold has no noise there.
+    channels = [(k, i) for k, i in np.ndindex(records, signals) if measured[k, :, i].any()]
+    deviation = np.ones((records, 1, signals))
+    for k, i in channels:
+        deviation[k, 0, i] = _deviation(residual[k, :, i][measured[k, :, i]])
     standardised = np.where(measured, residual, 0.0) / deviation
     basis = _basis(np.where(measured, responses, 0.0) / deviation)
     left = standardised - _combined(basis, standardised)
     # Directions that were taken of each output, a share of one where it is in several.
-    taken = np.sum(basis**2, axis=(0, 1, 2))
-    variances = np.sum(left**2, axis=(0, 1)) / np.maximum(measured.sum(axis=(0, 1)) - taken, 1.0)
-    noises = [ResidualNoise(float("nan"), np.zeros(0), float(v), float(v)) for v in variances]
+    taken = np.sum(basis**2, axis=(1, 2))
+    variances = np.sum(left**2, axis=1) / np.maximum(measured.sum(axis=1) - taken, 1.0)
+    noises = {channel: _white(variances[channel]) for channel in channels}
+
+    def of(series, channel):
+        k, i = channel
+        return series[k : k + 1, ..., i]
+
     # What the projection took of the noise depends on the noise, first taken to be white: a few rounds settle it.
     for _ in range(4):
-        inside = np.sum([meat(basis[..., i], noise) for i, noise in enumerate(noises)], axis=0)
-        absorbed = [
-            absorbed_by_the_fit(basis[..., i], measured[..., i], noise, np.eye(basis.shape[-2]), inside)
-            for i, noise in enumerate(noises)
-        ]
-        noises = [
-            residual_noise(left[..., i], measured[..., i], "auto", absorbed[i], float(taken[i]))
-            for i in range(residual.shape[-1])
-        ]
-        if not any(len(noise.coefficients) for noise in noises):
+        inside = np.sum([meat(of(basis, c), noise) for c, noise in noises.items()], axis=0)
+        absorbed = {
+            c: absorbed_by_the_fit(of(basis, c), of(measured, c), noise, np.eye(basis.shape[-2]), inside)
+            for c, noise in noises.items()
+        }
+        noises = {
+            c: residual_noise(of(left, c), of(measured, c), "auto", absorbed[c], float(taken[c])) for c in channels
+        }
+        if not any(len(noise.coefficients) for noise in noises.values()):
             break
-    in_units = [
-        n._replace(variance=n.variance * d**2, innovation_variance=n.innovation_variance * d**2)
-        for n, d in zip(noises, deviation, strict=True)
-    ]
-    return whitening(in_units, measured)
+
+    def in_units(k, i):
+        noise, square = noises.get((k, i), _white(1.0)), deviation[k, 0, i] ** 2
+        return noise._replace(
+            variance=noise.variance * square, innovation_variance=noise.innovation_variance * square
+        )  # fmt: skip
+
+    return whitening([[in_units(k, i) for i in range(signals)] for k in range(records)], measured)
 
 
 def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:

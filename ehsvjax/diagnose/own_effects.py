@@ -80,16 +80,17 @@ def _finite(bench: Workbench, candidate: Candidate, own) -> tuple[np.ndarray, np
 
 
 def _run(bench: Workbench, candidate: Candidate, own) -> tuple[np.ndarray, np.ndarray]:
-    """Return what runs along a signal, `[time]`, and what an effect makes of it."""
+    """Return what runs along a signal in the first record, `[time]`, and what an effect makes of it."""
     effect, signal = candidate.effect, candidate.signal
-    samples = bench.problem.samples
-    count, period = samples.inputs.shape[1], float(samples.sample_period[0])
+    first = bench.records[0]
+    count, period = len(first), first.sample_period
     at_input = signal in bench.fit.model.inputs
     constant = effect.kind in ("parameter", "constant")
-    series = samples.inputs[0, :, bench.fit.model.inputs.index(signal)] if at_input else (
-        np.full(count, bench.fit.model.nominal[signal]) if constant else bench.internal.values[signal]
+    series = first.inputs[signal] if at_input else (
+        np.full(count, bench.fit.model.nominal[signal]) if constant else bench.internal.values[signal][0, :count]
     )  # fmt: skip
-    along = {"time": np.arange(count) * period, **({} if at_input or constant else bench.internal.contexts[signal])}
+    context = {} if at_input or constant else bench.internal.contexts[signal]
+    along = {"time": np.arange(count) * period} | {name: series[0, :count] for name, series in context.items()}
     held = {"duration": count * period, "step_size": period, "sample_period": period}
     with jax.enable_x64(True):
         own = {name: jnp.float64(number) for name, number in own.items()}

@@ -27,6 +27,8 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
     environment = Environment(loader=PackageLoader("ehsvjax.diagnose", "."), autoescape=True, undefined=StrictUndefined)
     page = environment.get_template("page.html").render(
         diagnosis=diagnosis,
+        title=words.title(diagnosis),
+        these=words.these(diagnosis),
         verdict=words.verdict(diagnosis),
         misfit=words.misfit_lines(diagnosis),
         causes=words.cause_lines(diagnosis),
@@ -38,7 +40,7 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
         tests_after=diagnosis.misfit.tests_after,
         extended=str(diagnosis.extended),
         picture=embedded(to_png(plot_diagnosis(diagnosis))),
-        fitted=embedded(to_png(plot_fit(diagnosis.extended, diagnosis.record))),
+        fitted=[embedded(to_png(plot_fit(diagnosis.extended, record))) for record in diagnosis.extended.records],
     )
     file = Path(file_path("path", path))
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -36,13 +36,12 @@ def plot_diagnosis(diagnosis: Diagnosis) -> "matplotlib.figure.Figure":
 
     Bands hold 95% of what noise alone would give.
     """
-    names = list(diagnosis.misfit.outputs)
+    names = list(dict.fromkeys(name for outputs in diagnosis.misfit.by_record for name in outputs))
     missing = diagnosis.missing is not None
     with _style():
         figure = _figure(width=10.0, height=4.6 * len(names) + 3.4)
         said = ": ".join(part for part in (diagnosis.verdict, _words(words.causes(diagnosis))) if part)
-        title = f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {said}"
-        figure.suptitle(textwrap.fill(title, _TITLE_WIDTH))
+        figure.suptitle(textwrap.fill(f"{words.title(diagnosis)}: {said}", _TITLE_WIDTH))
         parts = figure.subfigures(len(names) + 1, 1, height_ratios=[4.6] * len(names) + [3.4], squeeze=False)[:, 0]
         for part, name in zip(parts, names, strict=False):
             _draw_output(part, diagnosis, name)
@@ -55,48 +54,65 @@ def plot_diagnosis(diagnosis: Diagnosis) -> "matplotlib.figure.Figure":
 
 
 def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
-    found = diagnosis.misfit.outputs[name]
+    """Draw one output, records one after the other."""
+    there = [k for k, outputs in enumerate(diagnosis.misfit.by_record) if name in outputs]
+    found = [diagnosis.misfit.by_record[k][name] for k in there]
     unit = diagnosis.fit.model.unit(name)
     grid = part.add_gridspec(2, _PANELS, height_ratios=[1.0, 1.1])
-    series = part.add_subplot(grid[0, :2])
-    spectrum = part.add_subplot(grid[0, 2])
-    time = diagnosis.record.time
-    factor, label = _scaled(found.residual, unit)
-    before = {"color": _MEASURED, "ls": "none", "marker": ".", "ms": 2.0, "rasterized": True}
-    series.plot(time, found.residual / factor, label="the model", **before)
-    after = np.where(np.isnan(found.residual), np.nan, diagnosis.extended.residuals(diagnosis.record)[name])
-    if diagnosis.extended.model is not diagnosis.fit.model:
-        series.plot(time, after / factor, label="extended", **{**before, "color": _MODEL})
-    reach = 1.96 * found.noise_floor / factor
-    series.axhspan(-reach, reach, color=_COMMAND, alpha=0.12, lw=0, label="95% of the noise")
-    series.set(xlabel="time (s)", ylabel=f"residual of\n{_words(name)} {label}")
+    series, spectrum = part.add_subplot(grid[0, :2]), part.add_subplot(grid[0, 2])
+    factor, label = _scaled(np.concatenate([m.residual for m in found]), unit)
+    dots = {"ls": "none", "marker": ".", "ms": 2.0, "rasterized": True}
+    begins = 0.0
+    for k, m in zip(there, found, strict=True):
+        record = diagnosis.extended.records[k]
+        time = record.time if len(there) == 1 else begins + record.time - record.time[0]
+        # In the legend once.
+        of_model, of_extended, of_noise = (
+            ("the model", "extended", "95% of the noise") if k == there[0] else (None, None, None)
+        )
+        series.plot(time, m.residual / factor, color=_MEASURED, label=of_model, **dots)
+        if diagnosis.extended.model is not diagnosis.fit.model:
+            after = np.where(np.isnan(m.residual), np.nan, diagnosis.extended.residuals(record)[name])
+            series.plot(time, after / factor, color=_MODEL, label=of_extended, **dots)
+        reach, ends = 1.96 * m.noise_floor / factor, time[-1] + record.sample_period
+        series.fill_between([time[0], ends], -reach, reach, color=_COMMAND, alpha=0.12, lw=0, label=of_noise)
+        if k != there[0]:
+            series.axvline(begins, color=_AXIS, lw=0.8)
+        begins = ends
+        shown = m.in_frequency
+        spectrum.loglog(shown.frequency, shown.residual, color=_MEASURED, label=of_model and "residual")
+        spectrum.loglog(shown.frequency, shown.noise, color=_COMMAND, label=of_noise and "noise")
+    along = "time (s)" if len(there) == 1 else "time, records one after the other (s)"
+    series.set(xlabel=along, ylabel=f"residual of\n{_words(name)} {label}")
     _legend(series)
-    shown = found.in_frequency
-    spectrum.loglog(shown.frequency, shown.residual, color=_MEASURED, label="residual")
-    spectrum.loglog(shown.frequency, shown.noise, color=_COMMAND, label="noise")
     spectrum.set(xlabel="frequency (Hz)", ylabel=f"power ({unit}²/Hz)" if unit else "power (1/Hz)")
     _legend(spectrum)
-    for k, quantity in enumerate(_most_telling(found.against)):
+    for k, quantity in enumerate(_most_telling([m.against for m in found])):
         axes = part.add_subplot(grid[1, k])
-        profile = found.against[quantity]
-        across, across_label = _scaled(profile.middle, quantity_unit(diagnosis.fit.model, quantity))
-        mean, mean_label = _scaled(profile.mean, unit)
-        axes.fill_between(
-            profile.middle / across, -1.96 * profile.deviation / mean, 1.96 * profile.deviation / mean,
-            color=_COMMAND, alpha=0.15, lw=0,
-        )  # fmt: skip
-        axes.plot(profile.middle / across, profile.mean / mean, color=_MEASURED, marker="o", ms=4)
+        profiles = [m.against[quantity] for m in found if quantity in m.against]
+        across, across_label = _scaled(
+            np.concatenate([p.middle for p in profiles]), quantity_unit(diagnosis.fit.model, quantity)
+        )
+        mean, mean_label = _scaled(np.concatenate([p.mean for p in profiles]), unit)
+        for profile in profiles:
+            axes.fill_between(
+                profile.middle / across, -1.96 * profile.deviation / mean, 1.96 * profile.deviation / mean,
+                color=_COMMAND, alpha=0.15, lw=0,
+            )  # fmt: skip
+            axes.plot(profile.middle / across, profile.mean / mean, color=_MEASURED, marker="o", ms=4)
         axes.axhline(0.0, color=_AXIS, lw=0.8)
         axes.set(xlabel=f"{_words(quantity)} {across_label}", ylabel=f"mean residual {mean_label}")
 
 
-def _most_telling(against) -> list[str]:
-    """Return the quantities against which the mean residual differs most from nothing."""
+def _most_telling(each) -> list[str]:
+    """Return the quantities against which the mean residual differs most from nothing, in some record."""
 
-    def excess(profile):
-        return float(np.mean((profile.mean / profile.deviation) ** 2))
+    def excess(quantity):
+        profiles = [against[quantity] for against in each if quantity in against]
+        return max(float(np.mean((profile.mean / profile.deviation) ** 2)) for profile in profiles)
 
-    return sorted(against, key=lambda quantity: -excess(against[quantity]))[:_PANELS]
+    quantities = dict.fromkeys(quantity for against in each for quantity in against)
+    return sorted(quantities, key=lambda quantity: -excess(quantity))[:_PANELS]
 
 
 def _draw_suspects(axes, diagnosis: Diagnosis) -> None:

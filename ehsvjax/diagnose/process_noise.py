@@ -9,8 +9,8 @@ record, whose responses H are simulated, and an autoregression for the sensor.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 
+from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import parts_at
 from ehsvjax.diagnose.refits import Refits, span
 from ehsvjax.diagnose.workbench import Workbench
@@ -33,26 +33,33 @@ class ProcessNoise(NamedTuple):
     of_sensor: float
 
 
-def process_noise(bench: Workbench, final: Refits, used: Bool[np.ndarray, "record time signal"]) -> ProcessNoise | None:
+def process_noise(bench: Workbench, final: Refits, white: Whitening) -> ProcessNoise | None:
     """Compare a random force with noise of the sensor; None for several outputs, or a model without a force.
 
-    By the samples that are `used` for any other explanation too: likelihoods of other samples are no comparison.
+    By the samples that are used for any other explanation too, as `white` says: likelihoods of others are no
+    comparison.
     """
     kinds = {s.name: s.kind for s in bench.fit.model.signals}
     places = [p for p in bench.places if kinds[p] == "force"]
     if not places or len(bench.problem.observed) > 1:
         return None
-    measured = used[..., 0]
-    known = span(final.slopes[0][..., 0][:, measured])
-    residual = final.residual[0][..., 0]
+    measured = white.used[..., 0]
+    # Each record in deviations of its own noise.
+    deviation = np.sqrt(white.variances)
+    known = span((final.slopes[0][..., 0] / deviation)[:, measured])
+    residual = final.residual[0][..., 0] / deviation
     r = residual[measured]
     r = r - known @ (known.T @ r)
     parts = parts_at(bench, final.points[0], places[0])
-    h = parts.responses[..., 0][:, measured]
+    h = (parts.responses[..., 0] / deviation)[:, measured]
     h = h - (h @ known) @ known.T
     intensity, force = _likelihood_of_force(h, r)
-    sensor = _likelihood_of_sensor(np.where(measured, residual, 0.0), measured, len(r))
-    return ProcessNoise(places[0], intensity * parts.length, 2.0 * force, 2.0 * sensor)
+    sensor = sum(
+        _likelihood_of_sensor(np.where(there, one, 0.0)[None], there[None])
+        for one, there in zip(residual, measured, strict=True)
+    )
+    units = white.log_units
+    return ProcessNoise(places[0], intensity * parts.length, 2.0 * force - units, 2.0 * sensor - units)
 
 
 def _likelihood_of_force(h, r) -> tuple[float, float]:
@@ -74,8 +81,9 @@ def _likelihood_of_force(h, r) -> tuple[float, float]:
     return float(np.exp(best.x) * profiled(best.x)[1]), -float(best.fun)
 
 
-def _likelihood_of_sensor(residual, measured, count) -> float:
+def _likelihood_of_sensor(residual, measured) -> float:
     """Return the log-likelihood of the best noise of a sensor, less half of Bayes' price for its numbers."""
+    count = int(measured.sum())
     scale = float(np.std(residual[measured]))
     best = -np.inf
     for colour in ("white", "coloured"):

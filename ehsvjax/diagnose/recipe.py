@@ -25,7 +25,8 @@ from ehsvjax.draws import check_key
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
 from ehsvjax.fit import Fit
-from ehsvjax.record import Record
+from ehsvjax.population import stack_records
+from ehsvjax.record import Record, checked_records
 from ehsvjax.simulate import input_array
 
 # Fewer cannot tell noise from misfit.
@@ -34,50 +35,62 @@ _LEAST_SAMPLES = 100
 
 def diagnose(
     fit: Fit,
-    record: Record,
-    validation: Record | None = None,
+    records: Record | Sequence[Record],
+    validation: Record | Sequence[Record] | None = None,
     *,
     key: Key[Array, ""],
     bank: Sequence[Effect] = BANK,
     progress: bool | None = None,
 ) -> Diagnosis:
-    """Say what a fitted model gets wrong on a record, name the cause, extend the model and measure the gain.
+    """Say what a fitted model gets wrong on records, name the cause, extend the model and measure the gain.
 
     Every effect of the bank is tried at every signal of the model that takes it; see `ehsvjax.effects` for how to add
     one of yours. The first call for a model and a record's length compiles for some 10 s, further ones nothing.
 
+    Several records share the parameters of the model and the causes; each has its own length, sample period, outputs,
+    known constants, initial conditions and noise, and of a cause that goes by its clock, a drift or a periodic force,
+    its own amplitudes.
+
     Args:
         fit: of the model, by `identify`.
-        record: measured; the one that was fitted, or another.
-        validation: another record, on which the gain is measured; by default the last 30% of the record are held back
-            for it.
+        records: measured, one or several; those that were fitted, or others.
+        validation: other records, on which the gain is measured; by default each of several records is predicted from
+            the others, and the last 30% of a single one are held back.
         key: random key, `jax.random.key(0)`, for the intervals of the gain.
         bank: the candidate effects.
         progress: show a bar with the stage and the time that is left; by default in a terminal or a notebook.
 
     Raises:
-        ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short, an
-            effect of yours that fits no signal of the model, or one that is in the bank twice.
+        ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short,
+            records of different hold, an effect of yours that fits no signal of the model, or one that is in the bank
+            twice.
 
     """
     bank = _check_bank(bank)
-    _check(fit, record, validation, key, progress)
+    measured = checked_records(records)
+    unseen = () if validation is None else checked_records(validation, "validation")
+    _check(fit, measured, unseen, key, progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
     with progress_bar(progress) as say:
-        return _diagnosed(fit, record, validation, bank, rng, say)
+        return _diagnosed(fit, measured, unseen, bank, rng, say)
 
 
 def _diagnosed(
-    fit: Fit, record: Record, validation: Record | None, bank: tuple[Effect, ...], rng, say: Progress
+    fit: Fit,
+    records: tuple[Record, ...],
+    validation: tuple[Record, ...],
+    bank: tuple[Effect, ...],
+    rng,
+    say: Progress,
 ) -> Diagnosis:
     say("simulating the model", 0.0)
-    bench = workbench(fit, record, bank)
+    bench = workbench(fit, records, bank)
     check_own_effects(bench, bank)
     bench, outliers = _without_spikes(bench)
     selection = select(bench, say)
     say("testing what is left", 0.8)
     examined = examine(selection)
-    nominal = as_fit(examined.selection, selection.nominal, (), record)
+    nominal = as_fit(examined.selection, selection.nominal, ())
     wider, gain, verdict = _judged(examined, nominal, validation, rng)
     if verdict[0] == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
         # What was added on the way to no explanation does not predict: it is left out again, and all is judged anew.
@@ -102,45 +115,44 @@ def _diagnosed(
         process_noise=examined.chance,
         integration=selection.integration,
         fit=fit,
-        record=record,
+        records=records,
     )
 
 
-def _judged(examined: Examination, nominal: Fit, validation: Record | None, rng: np.random.Generator):
+def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...], rng: np.random.Generator):
     """Return the extended model's fit, its gain, and the verdict."""
     selection, wider = examined.selection, nominal
     if selection.included:
-        wider = as_fit(selection, selection.final, selection.included, nominal.records[0])
+        wider = as_fit(selection, selection.final, selection.included)
     return wider, gain_of(selection, nominal, wider, validation, rng), verdict_of(examined)
 
 
-def _check(fit, record, validation, key, progress) -> None:
+def _check(fit, records, validation, key, progress) -> None:
     if not isinstance(fit, Fit):
         raise ValueError(f"expected a fit as identify returns it, got {type(fit).__name__}")
-    for name, one in (("record", record), ("validation", validation)):
-        if not isinstance(one, Record) and not (name == "validation" and one is None):
-            raise ValueError(f"expected {name} to be a Record, got {type(one).__name__}: make one with Record.from_csv")
-        if one is not None and not set(one.outputs) & set(fit.outputs):
+    for one in (*records, *validation):
+        if not set(one.outputs) & set(fit.outputs):
             raise ValueError(
-                f"expected {name} to hold an output that was fitted, {', '.join(fit.outputs)}; it has "
+                f"expected {one.name} to hold an output that was fitted, {', '.join(fit.outputs)}; it has "
                 f"{', '.join(one.outputs) or 'none'}"
             )
-    if set(record.outputs) - set(fit.outputs):
-        raise ValueError(
-            f"expected a record with outputs that were fitted, {', '.join(fit.outputs)}; it also has "
-            f"{', '.join(sorted(set(record.outputs) - set(fit.outputs)))}: drop them with .select, or fit them too"
-        )
+        input_array(fit.model, one)
     check_key(key)
     if progress is not None:
         flag("progress", progress)
-    for one in (record, *([] if validation is None else [validation])):
-        input_array(fit.model, one)
-    measured = min(int(np.isfinite(record.outputs[name]).sum()) for name in record.outputs)
-    if measured < _LEAST_SAMPLES:
-        raise ValueError(
-            f"expected at least {_LEAST_SAMPLES} measured samples of every output of {record.name}, to tell noise "
-            f"from misfit; got {measured}"
-        )
+    for record in records:
+        if set(record.outputs) - set(fit.outputs):
+            raise ValueError(
+                f"expected records with outputs that were fitted, {', '.join(fit.outputs)}; {record.name} also has "
+                f"{', '.join(sorted(set(record.outputs) - set(fit.outputs)))}: drop them with .select, or fit them too"
+            )
+        measured = min(int(np.isfinite(values).sum()) for values in record.outputs.values())
+        if measured < _LEAST_SAMPLES:
+            raise ValueError(
+                f"expected at least {_LEAST_SAMPLES} measured samples of every output of {record.name}, to tell noise "
+                f"from misfit; got {measured}"
+            )
+    stack_records(fit.model, records)
 
 
 def _check_bank(bank) -> tuple[Effect, ...]:

@@ -73,8 +73,7 @@ def bounds_of(bench: Workbench) -> tuple[Float[np.ndarray, " parameter"], Float[
     lower, upper = np.zeros(len(bench.nominal)), np.ones(len(bench.nominal))
     for candidate in bench.candidates:
         scales = bench.scales[candidate.name]
-        for number in candidate.effect.parameters:
-            j = bench.column[candidate.parameter(number.name)]
+        for number, j in bench.unknowns_of(candidate):
             unit = bench.problem.coordinates.upper[j]
             low, high = number.lower(scales), number.upper(scales)
             lower[j] = -np.inf if low <= -UNLIMITED else low / unit

@@ -10,7 +10,7 @@ from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.significance import INSEPARABLE
-from ehsvjax.diagnose.trials import REFITTED_TOGETHER, Trials, fits, refit_screened, refit_sets, without
+from ehsvjax.diagnose.trials import REFITTED_TOGETHER, Trials, fits, refit_screened, refit_set, refit_sets, without
 from ehsvjax.diagnose.workbench import Workbench
 
 PER_NUMBER = 4.0
@@ -30,9 +30,8 @@ def price(bench: Workbench, candidate: int, point: Float[np.ndarray, " parameter
 
     A constant that was given wrong, the commonest cause of all, may be off by any factor; a sensor hardly by a third.
     """
-    found = bench.candidates[candidate]
-    sizes = [n for n in found.effect.parameters if n.absent is not None]
-    rarest = max(n.rarity(bench.value(point, found.parameter(n.name))) for n in sizes)
+    unknowns = bench.unknowns_of(bench.candidates[candidate])
+    rarest = max(number.rarity(bench.value(point, j)) for number, j in unknowns if number.absent is not None)
     return PER_NUMBER * (bench.numbers_of(candidate) + rarest)
 
 
@@ -117,7 +116,7 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, w
     """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
     start = without(bench, final.points[0], own)
-    current = refit_sets(trials, [[start]], [rest], white)
+    current = refit_set(trials, start, rest, white)
     base = _beside(trials, start, current, white) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
     found = _refitted_from(trials, base, own, rest, white, start)

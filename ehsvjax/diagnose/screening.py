@@ -127,23 +127,22 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
     """Return the steps of a candidate: of each amplitude, at each combination of its shapes."""
     scales = bench.scales[candidate.name]
     lower, _ = bounds_of(bench)
-    numbers = candidate.effect.parameters
-    amplitudes = [n for n in numbers if n.absent is not None]
-    shapes = [n for n in numbers if n.absent is None]
+    numbers = bench.unknowns_of(candidate)
+    amplitudes = [(number, j) for number, j in numbers if number.absent is not None]
+    shapes = [(number, j) for number, j in numbers if number.absent is None]
+    upper = bench.problem.coordinates.upper
     found = []
-    for values in itertools.product(*(n.tries(scales) for n in shapes)):
+    for values in itertools.product(*(number.tries(scales) for number, _ in shapes)):
         at = point.copy()
-        for number, value in zip(shapes, values, strict=True):
-            j = bench.column[candidate.parameter(number.name)]
-            at[j] = value / bench.problem.coordinates.upper[j]
-        for steps in itertools.zip_longest(*(n.tries(scales) for n in amplitudes)):
+        for (_, j), value in zip(shapes, values, strict=True):
+            at[j] = value / upper[j]
+        for steps in itertools.zip_longest(*(number.tries(scales) for number, _ in amplitudes)):
             moved = np.repeat(at[None], len(amplitudes), axis=0)
-            for row, (number, value) in enumerate(zip(amplitudes, steps, strict=True)):
-                j = bench.column[candidate.parameter(number.name)]
-                moved[row, j] = value / bench.problem.coordinates.upper[j]
-            first = bench.column[candidate.parameter(amplitudes[0].name)]
-            tried = amplitudes[0].tries(scales)
-            limited = amplitudes[0].absent == UNLIMITED or (amplitudes[0].absent == 0.0 and lower[first] >= 0.0)
+            for row, ((_, j), value) in enumerate(zip(amplitudes, steps, strict=True)):
+                moved[row, j] = value / upper[j]
+            number, first = amplitudes[0]
+            tried = number.tries(scales)
+            limited = number.absent == UNLIMITED or (number.absent == 0.0 and lower[first] >= 0.0)
             found.append(
                 Trial(
                     position,
@@ -238,11 +237,11 @@ def _p_value(u: Float[np.ndarray, "draw step"], trial: Trial) -> Float[np.ndarra
 def _start(bench: Workbench, trial: Trial, g, r, left):
     """Return the point from which to refit, the first amplitude there, SI, and what the step shows of which size."""
     candidate = bench.candidates[trial.candidate]
-    amplitudes = [n for n in candidate.effect.parameters if n.absent is not None]
-    columns = [bench.column[candidate.parameter(n.name)] for n in amplitudes]
+    amplitudes = {j: number.absent for number, j in bench.unknowns_of(candidate) if number.absent is not None}
+    columns = list(amplitudes)
     start = trial.points[0].copy()
     unit = bench.problem.coordinates.upper
-    absent = np.array([n.absent for n in amplitudes]) / unit[columns]
+    absent = np.array(list(amplitudes.values())) / unit[columns]
     steps = np.array([trial.points[row, j] for row, j in enumerate(columns)]) - absent
     if trial.proportional:
         factors = np.linalg.lstsq(g.T, r, rcond=None)[0]
@@ -250,6 +249,6 @@ def _start(bench: Workbench, trial: Trial, g, r, left):
         for j, step, nothing, factor in zip(columns, steps, absent, factors, strict=True):
             start[j] = np.clip(nothing + factor * step, lower[j], upper[j])
     amount = start[columns[0]] * unit[columns[0]]
-    if amplitudes[0].absent == UNLIMITED or not steps[0]:
+    if amplitudes[columns[0]] == UNLIMITED or not steps[0]:
         return start, float(amount), ()
     return start, float(amount), ((float(abs(steps[0] * unit[columns[0]])), float(left[0])),)

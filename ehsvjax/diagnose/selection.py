@@ -21,6 +21,7 @@ from ehsvjax.diagnose.trials import (
     fits,
     refit_reshaped,
     refit_screened,
+    refit_set,
     refit_sets,
     trials_of,
     without,
@@ -102,7 +103,7 @@ class Selection:
         return self.trials.bench
 
     @property
-    def seen(self) -> dict[str, Float[np.ndarray, " time"]]:
+    def seen(self) -> dict[str, Float[np.ndarray, "record time"]]:
         """What runs along the nominal model and varies, by name."""
         return self.trials.seen
 
@@ -123,7 +124,7 @@ def select(bench: Workbench, progress: Progress) -> Selection:
     progress("simulating every candidate", 0.15)
     trials = trials_of(bench, progress)
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
-    stages = [_look(trials, (), refit_sets(trials, [[bench.nominal]], [()], plain), plain)]
+    stages = [_look(trials, (), refit_set(trials, bench.nominal, (), plain), plain)]
     while len(stages[-1].included) < _MOST_EFFECTS:
         found = _next_effect(stages[-1])
         if found is None:
@@ -138,7 +139,7 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         last = weighed.stage
         start = without(last.trials.bench, last.current.points[0], weighed.needless)
         rest = tuple(j for j in last.included if j != weighed.needless)
-        refitted = refit_sets(last.trials, [[start]], [rest], last.white)
+        refitted = refit_set(last.trials, start, rest, last.white)
         weighed = _weighed(_look(last.trials, rest, refitted, last.white), nominal)
     last = weighed.stage
     return Selection(
@@ -182,7 +183,7 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     for rounds_left in reversed(range(_ROUNDS)):
         stage = stage._replace(included=included, current=final)
         trials, white = stage.trials, stage.white
-        nominal = refit_sets(trials, [[nominal.points[0]]], [()], white)
+        nominal = refit_set(trials, nominal.points[0], (), white)
         known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), white)
         if not rounds_left or (known is trials.bench and set(included) == looked_at):
             break
@@ -218,7 +219,7 @@ def _integration(begun: Workbench, ended: Workbench, worth: float) -> Integratio
     samples = ended.problem.samples
     left_out = (begun.problem.samples.measured & ~samples.measured).sum(axis=(0, 1))
     return Integration(
-        step_size=float(samples.sample_period[0]) / int(ended.problem.substeps),
+        step_size=float(np.max(samples.sample_period)) / int(ended.problem.substeps),
         left_out=dict(zip(ended.problem.observed, left_out.tolist(), strict=True)),
         worth=worth,
     )
@@ -253,11 +254,11 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, white: Whi
         trials, current = _known(before, included, current, white)
         if trials is before:
             break
-    if white.coloured or len(white.noises) > 1:
-        current = refit_sets(trials, [[current.points[0]]], [included], white)
+    if white.coloured or white.variances.size > 1:
+        current = refit_set(trials, current.points[0], included, white)
         tried = responses_at(bench, current, included, white, trials.parts)
     else:
-        # The variance of one output's white noise does not move the best fit.
+        # The variance of one record's and output's white noise does not move the best fit.
         current = current._replace(cost=np.array([_cost_under(current, white)]))
     return Stage(trials, included, current, white, screen(bench, current, tried, white, int(measured.sum()) // 2))
 
@@ -271,7 +272,7 @@ def _known(trials: Trials, included: tuple[int, ...], current: Refits, white: Wh
             return trials, current
         trials = trials._replace(bench=known)
         only_known = plain_noise(white.variances, known.problem.samples.measured)
-        current = refit_sets(trials, [[current.points[0]]], [included], only_known)
+        current = refit_set(trials, current.points[0], included, only_known)
 
 
 def _next_effect(stage: Stage) -> Stage | None:
@@ -352,7 +353,7 @@ def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
-        gain = float(refit_sets(trials, [[start]], [rest], stage.white).cost[0] - final.cost[0])
+        gain = float(refit_set(trials, start, rest, stage.white).cost[0] - final.cost[0])
         gains.append(gain)
         spare[i] = gain - required_gain(trials.bench, stage.screening, i)
     least = min(spare, key=lambda i: spare[i], default=None)

@@ -45,8 +45,7 @@ def table_of(selection: Selection) -> "pandas.DataFrame":
     rows = []
     for k, s in enumerate(screening.ranked):
         candidate = bench.candidates[s.candidate]
-        number = candidate.effect.parameters[0]
-        name = candidate.parameter(number.name)
+        number, column = bench.unknowns_of(candidate)[0]
         included = s.candidate in gains
         others = dict.fromkeys(
             bench.candidates[o.candidate].name
@@ -56,8 +55,8 @@ def table_of(selection: Selection) -> "pandas.DataFrame":
             _Row(
                 candidate.name,
                 candidate.signal,
-                bench.value(selection.final.points[0], name) if included else s.amount,
-                bench.model.parameter(name).unit,
+                bench.value(selection.final.points[0], column) if included else s.amount,
+                bench.model.parameter(candidate.parameter(number.name)).unit,
                 s.score,
                 s.p_value,
                 s.corrected,

@@ -42,7 +42,7 @@ class Trials(NamedTuple):
     """
 
     bench: Workbench
-    seen: dict[str, Float[np.ndarray, " time"]]
+    seen: dict[str, Float[np.ndarray, "record time"]]
     terms: Terms
     parts: dict[str, Parts]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
@@ -91,6 +91,13 @@ def refit_sets(
     return found
 
 
+def refit_set(
+    trials: Trials, start: Float[np.ndarray, " parameter"], included: Sequence[int], white: Whitening
+) -> Refits:
+    """Refit one set of effects from one start; see `refit_sets`."""
+    return refit_sets(trials, [[start]], [included], white)
+
+
 def refit_screened(
     trials: Trials,
     some: Sequence[Screened],
@@ -119,12 +126,11 @@ def refit_reshaped(
     Frequencies are searched elsewhere.
     """
     bench = trials.bench
-    effect = bench.candidates[candidate].effect
-    shapes = [n for n in effect.parameters if n.absent is None and not effect.harmonic]
+    harmonic = bench.candidates[candidate].effect.harmonic
+    shapes = [j for n, j in bench.unknowns_of(bench.candidates[candidate]) if n.absent is None and not harmonic]
     lower, upper = bounds_of(bench)
     starts = []
-    for number, factor in itertools.product(shapes, _SHAPES):
-        j = bench.column[bench.candidates[candidate].parameter(number.name)]
+    for j, factor in itertools.product(shapes, _SHAPES):
         start = current.points[0].copy()
         start[j] = np.clip(factor * start[j], lower[j], upper[j])
         starts.append(start)
@@ -184,7 +190,7 @@ def _grown(
     starts, columns, of = [], [], []
     for k, screened in enumerate(some):
         candidate = bench.candidates[screened.candidate]
-        numbers = {bench.column[candidate.parameter(n.name)]: n.absent for n in candidate.effect.parameters}
+        numbers = {j: number.absent for number, j in bench.unknowns_of(candidate)}
         if UNLIMITED in numbers.values():
             continue
         for point in points:
@@ -203,10 +209,10 @@ def _grown(
 def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " parameter"]]:
     """Return the start of a candidate, and starts with more or less of the effect, which may be far from linear."""
     candidate = bench.candidates[screened.candidate]
-    amplitudes = [n for n in candidate.effect.parameters if n.absent is not None]
-    columns = [bench.column[candidate.parameter(n.name)] for n in amplitudes]
+    amplitudes = {j: number.absent for number, j in bench.unknowns_of(candidate) if number.absent is not None}
+    columns = list(amplitudes)
     # Shares of a limit are shares of itself: where it hardly acts yet, no derivative tells how low it is.
-    nothing = np.array([0.0 if n.absent == UNLIMITED else n.absent for n in amplitudes])
+    nothing = np.array([0.0 if absent == UNLIMITED else absent for absent in amplitudes.values()])
     absent = nothing / bench.problem.coordinates.upper[columns]
     lower, upper = bounds_of(bench)
     starts = [screened.start]

@@ -45,11 +45,12 @@ def _names(selection: Selection, group: tuple[Rival, ...]) -> tuple[str, ...]:
 
 def _quantised(selection: Selection) -> tuple[str, ...]:
     samples, observed = selection.bench.problem.samples, selection.bench.problem.observed
-    coarse = []
-    for i, name in enumerate(observed):
-        step = lattice(samples.outputs[0, :, i][samples.measured[0, :, i]])
-        if step is not None and step**2 > _COARSEST**2 * (selection.white.noises[i].variance - step**2 / 12.0):
-            coarse.append(name)
+    coarse: dict[str, None] = {}
+    for k, noises in enumerate(selection.white.noises):
+        for i, name in enumerate(observed):
+            step = lattice(samples.outputs[k, :, i][samples.measured[k, :, i]])
+            if step is not None and step**2 > _COARSEST**2 * (noises[i].variance - step**2 / 12.0):
+                coarse[name] = None
     return tuple(QUANTISATION if len(observed) == 1 else f"{QUANTISATION}@{name}" for name in coarse)
 
 

@@ -1,6 +1,7 @@
 """A diagnosis in sentences."""
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,10 +16,16 @@ _NAMED = 10
 
 def sentences(diagnosis: "Diagnosis") -> list[str]:
     """Return the diagnosis as lines of text, what matters first."""
-    lines = [f"{diagnosis.fit.model.name} on {diagnosis.record.name}: {verdict(diagnosis)}", ""]
+    lines = [f"{title(diagnosis)}: {verdict(diagnosis)}", ""]
     lines += [f"  {line}" for line in (*misfit_lines(diagnosis), *cause_lines(diagnosis), *gain_lines(diagnosis))]
     lines += [f"  {line}" for line in (*next_lines(diagnosis), integration_line(diagnosis))]
     return lines
+
+
+def title(diagnosis: "Diagnosis") -> str:
+    """Return what was diagnosed on which records."""
+    names = [record.name for record in diagnosis.records]
+    return f"{diagnosis.fit.model.name} on {' and '.join(filter(None, [', '.join(names[:-1]), names[-1]]))}"
 
 
 def integration_line(diagnosis: "Diagnosis") -> str:
@@ -41,7 +48,7 @@ def verdict(diagnosis: "Diagnosis") -> str:
     if diagnosis.verdict == "named":
         return f"{causes(diagnosis)}.{left}"
     if diagnosis.verdict == "ambiguous":
-        return f"ambiguous: {causes(diagnosis)}: this record cannot tell.{left}"
+        return f"ambiguous: {causes(diagnosis)}: {these(diagnosis)} cannot tell.{left}"
     better = "a single term explains the record better than several effects of the bank together"
     why = better if diagnosis.innocent else "no effect of the bank leaves an innocent residual"
     return f"unexplained. Something is missing, and {why}."
@@ -57,11 +64,14 @@ def causes(diagnosis: "Diagnosis") -> str:
 def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what the nominal model gets wrong, a line for each output."""
     lines = []
-    for name, m in diagnosis.misfit.outputs.items():
+    # What was fitted to these very records is refitted to where it was.
+    as_fitted = set(diagnosis.records) == set(diagnosis.fit.records)
+    for record, name, m in _of_each(_names(diagnosis), diagnosis.misfit.by_record):
         unit = _spaced(diagnosis.fit.model.unit(name))
         kind = "coloured" if m.coloured else "white"
+        predicted = "" if as_fitted else f"rmse {m.rmse_predicted:.4g}{unit} as it was fitted; refitted "
         lines.append(
-            f"{name}: rmse {m.rmse:.4g}{unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
+            f"{record}{name}: {predicted}rmse {m.rmse:.4g}{unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
             f"{100 * m.above_noise:.1f}% of the squared error is misfit"
         )
         if m.outliers.any():
@@ -84,19 +94,12 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
 def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
     lines = []
-    readings = sum(int(np.isfinite(m.residual).sum()) for m in diagnosis.misfit.outputs.values())
+    readings = sum(int(np.isfinite(m.residual).sum()) for of in diagnosis.misfit.by_record for m in of.values())
     included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
     for row in included.drop_duplicates("cause").itertuples():
-        numbers = {
-            name.removeprefix(f"{row.cause}."): value
-            for name, value in diagnosis.extended.parameters.items()
-            if name.startswith(f"{row.cause}.")
-        }
-        said = ", ".join(
-            f"{name} {value:.4g}{_spaced(diagnosis.extended.model.parameter(f'{row.cause}.{name}').unit)}"
-            for name, value in numbers.items()
+        what = (
+            _instead(diagnosis, str(row.cause)) or f"{row.cause} at {row.signal}: {_sizes(diagnosis, str(row.cause))}"
         )
-        what = _instead(diagnosis, str(row.cause), numbers) or f"{row.cause} at {row.signal}: {said}"
         lines.append(
             f"{what}; without it the sum of squares over {readings} readings is {row.likelihood_gain:.4g} times the "
             f"variance of that noise more"
@@ -124,27 +127,53 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     return lines
 
 
-def _instead(diagnosis: "Diagnosis", cause: str, numbers: dict[str, float]) -> str | None:
+def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Any]]:
+    """Return what there is of each output in each record, with the names of both; of a single record without."""
+    said = [f"{name}, " if len(names) > 1 else "" for name in names]
+    return [(name, output, m) for name, outputs in zip(said, by_record, strict=True) for output, m in outputs.items()]
+
+
+def _names(diagnosis: "Diagnosis") -> list[str]:
+    return [record.name for record in diagnosis.records]
+
+
+def _sizes(diagnosis: "Diagnosis", cause: str) -> str:
+    """Return the numbers of a cause with their units; of its run, one for each record."""
+    model, said = diagnosis.extended.model, []
+    for p in model.parameters:
+        own, _, number = p.name.rpartition(".")
+        if own == cause:
+            shared = diagnosis.extended.parameters.get(p.name)
+            each = [record.constants[p.name] for record in diagnosis.extended.records] if shared is None else [shared]
+            values = ", ".join(f"{value:.4g}" for value in each)
+            said.append(f"{number} {values}{_spaced(p.unit)}")
+    return ", ".join(said)
+
+
+def _instead(diagnosis: "Diagnosis", cause: str) -> str | None:
     """Return what a constant is instead of what was given; None for any other cause."""
     given = next((p for p in diagnosis.fit.model.parameters if p.name == cause), None)
-    if given is None or not numbers:
+    found_at = diagnosis.extended.parameters
+    if given is None or not {f"{cause}.error", f"{cause}.value"} & set(found_at):
         return None
-    found = given.value * (1.0 + numbers["error"]) if "error" in numbers else numbers["value"]
+    error = found_at.get(f"{cause}.error")
+    found = found_at[f"{cause}.value"] if error is None else given.value * (1.0 + error)
     return f"{cause}: {found:.4g}{_spaced(given.unit)} instead of the {given.value:.4g} that was given"
 
 
 def gain_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what the extension gains, a line for each output."""
     lines = []
-    for name, g in diagnosis.gain.outputs.items():
+    for record, name, g in _of_each(diagnosis.gain.records, diagnosis.gain.by_record):
         unit = _spaced(diagnosis.fit.model.unit(name))
         if diagnosis.extended.model.name == diagnosis.fit.model.name:
             lines.append(
-                f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g}{unit}, noise {g.noise_floor:.4g}{unit}"
-            )  # fmt: skip
+                f"on {diagnosis.gain.on}: {record}{name} rmse {g.rmse_before:.4g}{unit}, noise "
+                f"{g.noise_floor:.4g}{unit}"
+            )
             continue
         line = (
-            f"on {diagnosis.gain.on}: {name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g}{unit} "
+            f"on {diagnosis.gain.on}: {record}{name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g}{unit} "
             f"(noise {g.noise_floor:.4g}), fit {g.fit_before:.2f} -> {g.fit_after:.2f}%"
         )
         if np.isfinite(g.share_removed):
@@ -172,8 +201,13 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
             + (f"; and {more} more (see .excluded)" if more > 0 else "")
         )
         if diagnosis.unseen:
-            lines.append(f"cannot be seen in this record: {', '.join(diagnosis.unseen)}")
+            lines.append(f"{these(diagnosis)} cannot show: {', '.join(diagnosis.unseen)}")
     return lines
+
+
+def these(diagnosis: "Diagnosis") -> str:
+    """Return the records in words."""
+    return "this record" if len(diagnosis.records) == 1 else "these records"
 
 
 def _repeating(period: float | None, unit: str) -> str:

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax import arithmetic
 from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates, input_named
 from ehsvjax.effects.extended import disturbance, extended
-from ehsvjax.effects.internal import Internal, internal_signals
+from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
 from ehsvjax.effects.of_model import effects_for
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model, Parameter
-from ehsvjax.population import Problem, cast, simulated, to_unit, to_values
+from ehsvjax.population import Problem, cast, observed_outputs, simulated, to_unit, to_values
 from ehsvjax.record import Record
 from ehsvjax.unknowns import problem_of
 
@@ -42,19 +42,20 @@ TOLD_APART = 3e-5
 
 @dataclass(frozen=True, eq=False)
 class Workbench:
-    """A fit and a record, ready for trials.
+    """A fit and records, ready for trials.
 
     Attributes:
         fit: the fit that is diagnosed.
+        records: on which.
         model: its model with every candidate attached, and with disturbances.
-        problem: of that model and the record, in NumPy float64; an effect's number has its scale as unit.
+        problem: of that model and the records, in NumPy float64; an effect's number has its scale as unit.
         candidates: the effects at signals of the model.
         scales: of each candidate.
-        internal: what runs along the nominal model's signals.
+        internal: what runs along the nominal model's signals, `[record, time]`.
         places: signals that can be disturbed by a series.
         probes: place -> a disturbance, in the signal's unit, that moves the outputs by a little.
         disturbances: `[record, time, place]` what is added to them in every simulation; nothing at first.
-        column: name of an unknown -> its column; initial conditions are `name[record]`.
+        column: name of an unknown -> its column; of what each record has for itself, `name[record]`.
         nominal: `[parameter]` the point at which every effect is absent.
         differences: `[parameter]` of coordinates, for derivatives.
         sketched_at: integration steps per sample that know most readings: enough to see where a cause points.
@@ -62,6 +63,7 @@ class Workbench:
     """
 
     fit: Fit
+    records: tuple[Record, ...]
     model: Model
     problem: Problem
     candidates: tuple[Candidate, ...]
@@ -78,12 +80,32 @@ class Workbench:
     @property
     def base_columns(self) -> list[int]:
         """Columns of the nominal model's unknowns, initial conditions included."""
-        own = {self.column[c.parameter(p.name)] for c in self.candidates for p in c.effect.parameters}
+        own = {j for c in self.candidates for j in self.columns_of(c)}
         return [j for j in range(len(self.nominal)) if j not in own]
+
+    @property
+    def present(self) -> Bool[np.ndarray, "record time"]:
+        """Where the records have samples: the shorter ones are filled up."""
+        lengths = np.array([len(record) for record in self.records])
+        return np.arange(self.problem.samples.inputs.shape[1]) < lengths[:, None]
+
+    @property
+    def clock(self) -> Float[np.ndarray, "record time"]:
+        """The time in s since the start of each record."""
+        return np.arange(self.problem.samples.inputs.shape[1]) * self.problem.samples.sample_period[:, None]
+
+    def unknowns_of(self, candidate: Candidate) -> list[tuple[EffectParameter, int]]:
+        """Return an effect's numbers, each with its column; one that is of its run once for every record."""
+        found = []
+        for number in candidate.effect.parameters:
+            name = candidate.parameter(number.name)
+            each = [name] if name in self.column else [f"{name}[{k}]" for k in range(len(self.records))]
+            found += [(number, self.column[one]) for one in each]
+        return found
 
     def columns_of(self, candidate: Candidate) -> list[int]:
         """Columns of an effect's numbers."""
-        return [self.column[candidate.parameter(p.name)] for p in candidate.effect.parameters]
+        return [j for _, j in self.unknowns_of(candidate)]
 
     def columns_with(self, included: Sequence[int]) -> list[int]:
         """Columns of the nominal model's unknowns and of some candidates' numbers, by their positions."""
@@ -91,11 +113,11 @@ class Workbench:
 
     def numbers_of(self, candidate: int) -> int:
         """How many numbers the effect of a candidate has."""
-        return len(self.candidates[candidate].effect.parameters)
+        return len(self.columns_of(self.candidates[candidate]))
 
-    def value(self, point: Float[np.ndarray, " parameter"], name: str) -> float:
+    def value(self, point: Float[np.ndarray, " parameter"], column: int) -> float:
         """Value of one unknown at a point, SI."""
-        return float(to_values(self.problem.coordinates, point)[self.column[name]])
+        return float(to_values(self.problem.coordinates, point)[column])
 
     def simulated(
         self,
@@ -107,9 +129,8 @@ class Workbench:
 
         At the bench's integration steps per sample, or at others.
         """
-        with jax.enable_x64(True):
-            here = self.problem.substeps if substeps is None else np.int32(substeps)
-            problem = cast(replace(self.problem, substeps=here), jnp.float64)
+        here = self.problem.substeps if substeps is None else substeps
+        problem = replace(self._on_device, substeps=np.int32(here))
 
         def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
             some = points[first : first + _ABREAST]
@@ -122,7 +143,16 @@ class Workbench:
                 return np.asarray(_simulated(problem, filled, jnp.asarray(added)))[: len(some)]
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            return np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
+            every = np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
+        # What comes after the end of a record is nothing, whatever the model would do there.
+        every[:, ~self.present] = 0.0
+        return every
+
+    @functools.cached_property
+    def _on_device(self) -> Problem:
+        """The problem in double precision: to copy it for every simulation would take as long as some of them."""
+        with jax.enable_x64(True):
+            return cast(self.problem, jnp.float64)
 
     def stepped(self, points: Float[np.ndarray, "individual parameter"]) -> arithmetic.OutputsAt:
         """Return the outputs of some points by integration steps per sample, each simulated once."""
@@ -173,17 +203,19 @@ class Workbench:
         return change / self.differences[columns, None, None, None]
 
 
-def workbench(fit: Fit, record: Record, bank: Sequence[Effect]) -> Workbench:
-    """Set up the trials of a fit on a record.
+def workbench(fit: Fit, records: Sequence[Record], bank: Sequence[Effect]) -> Workbench:
+    """Set up the trials of a fit on records.
 
     Args:
         fit: of the nominal model.
-        record: to diagnose it on.
+        records: to diagnose it on.
         bank: the candidate effects.
 
     """
+    initial = [fit.initial_of(record) for record in records]
     # How much a force moves depends on the machine: on a larger one a probe of any fixed size is lost in rounding.
-    return _bench(fit, record, bank, _calibrated(_bench(fit, record, bank, {})))
+    probes = _calibrated(_bench(fit, records, initial, bank, {}))
+    return _bench(fit, records, initial, bank, probes)
 
 
 def _calibrated(bench: Workbench) -> dict[str, float]:
@@ -201,52 +233,67 @@ def _calibrated(bench: Workbench) -> dict[str, float]:
     }
 
 
-def _bench(fit: Fit, record: Record, bank: Sequence[Effect], probes: Mapping[str, float]) -> Workbench:
+def _bench(
+    fit: Fit,
+    records: Sequence[Record],
+    initial: Sequence[Mapping[str, float]],
+    bank: Sequence[Effect],
+    probes: Mapping[str, float],
+) -> Workbench:
     """Return the bench before its step is settled, with the probes that are known."""
     model = fit.model
-    initial = fit.initial_of(record)
-    internal = internal_signals(model, record, fit.parameters, initial)
-    found = candidates(model, (*bank, *effects_for(model)), internal.contexts, tuple(record.outputs))
+    internal = side_by_side(
+        [internal_signals(model, r, fit.parameters, start) for r, start in zip(records, initial, strict=True)]
+    )
+    observed = observed_outputs(model, records)
+    found = candidates(model, (*bank, *effects_for(model)), internal.contexts, observed)
     places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
     probes = {place: _probe(internal.values[place]) for place in places} | dict(probes)
     forces = [s.name for s in model.signals if s.kind in ("force", "load") and s.name in places]
-    scales = {c.name: _scales(model, c, internal, record, probes, forces) for c in found}
-    duration = len(record) * record.sample_period
+    scales = {c.name: _scales(model, c, internal, records, probes, forces) for c in found}
+    duration = duration_of(records)
     numbers = {c.parameter(p.name): _free(c, p, model, scales[c.name]) for c in found for p in c.effect.parameters}
     full = extended(model, found, numbers, duration, places)
-    quiet = {disturbance(place): np.zeros(len(record)) for place in places}
-    known = {n: v for n, v in initial.items() if n not in fit.estimated_initial}
+    quiet = [{disturbance(place): np.zeros(len(record)) for place in places} for record in records]
+    of_run = [
+        c.parameter(p.name) for c in found if c.effect.of_run for p in c.effect.parameters if p.absent is not None
+    ]
     problem = problem_of(
         full,
-        [replace(record, inputs={**record.inputs, **quiet})],
-        initial=known,
-        noise_variance={n: fit.noise_variance[n] for n in record.outputs},
+        [replace(record, inputs={**record.inputs, **nothing}) for record, nothing in zip(records, quiet, strict=True)],
+        initial=[{n: v for n, v in start.items() if n not in fit.estimated_initial} for start in initial],
+        noise_variance={n: fit.noise_variance[n] for n in observed},
+        # A single record has nothing for itself that it does not share.
+        by_record=of_run if len(records) > 1 else (),
     )
-    names = [*problem.free, *problem.free_initial]
-    column = {name: j for j, name in enumerate(names)}
+    column = {name: j for j, name in enumerate(problem.names)}
     coordinates = problem.coordinates
-    nominal, differences = np.zeros(len(names)), np.full(len(names), _DIFFERENCE)
+    nominal, differences = np.zeros(len(column)), np.full(len(column), _DIFFERENCE)
+    bench = Workbench(fit, tuple(records), full, problem, found, scales, internal, places, probes,
+                      np.zeros((*problem.samples.inputs.shape[:2], len(places))), column, nominal, differences,
+                      int(problem.substeps))  # fmt: skip
     for c in found:
-        for p in c.effect.parameters:
-            j = column[c.parameter(p.name)]
+        for p, j in bench.unknowns_of(c):
             tried = p.tries(scales[c.name])
             unit = max((abs(t) for t in tried), default=1.0) or 1.0
             coordinates.lower[j], coordinates.upper[j] = 0.0, unit
             nominal[j] = (p.absent if p.absent is not None else (tried[0] if len(tried) else unit)) / unit
             if p.absent is not None:
                 differences[j] = _DIFFERENCE_OF_SIZE
-    values = {**fit.parameters, **initial}
-    own = {column[c.parameter(p.name)] for c in found for p in c.effect.parameters}
-    for name, j in column.items():
-        if j not in own:
-            one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
-            nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[name]]))[0], 0.0, 1.0)
-    nothing = np.zeros((1, len(record), len(places)))
-    return Workbench(fit, full, problem, found, scales, internal, places, probes, nothing, column, nominal, differences,
-                     int(problem.substeps))  # fmt: skip
+    values = fit.parameters | {f"{n}[{k}]": value for k, start in enumerate(initial) for n, value in start.items()}
+    names = problem.names
+    for j in bench.base_columns:
+        one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
+        nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[names[j]]]))[0], 0.0, 1.0)
+    return bench
 
 
-def _probe(values: Float[np.ndarray, " time"]) -> float:
+def duration_of(records: Sequence[Record]) -> float:
+    """Return over how many s drifts are counted: the longest record."""
+    return max(len(record) * record.sample_period for record in records)
+
+
+def _probe(values: Float[np.ndarray, "record time"]) -> float:
     """Return a small part of what runs along a signal, or a small number where nothing does."""
     largest = float(np.max(np.abs(values)))
     return _PROBE * largest if 0.0 < largest < np.inf else _PROBE
@@ -260,7 +307,7 @@ def prepared(bench: Workbench) -> Workbench:
 
 
 def settled(
-    bench: Workbench, outputs_at: arithmetic.OutputsAt, noise_variance: Float[np.ndarray, " signal"]
+    bench: Workbench, outputs_at: arithmetic.OutputsAt, noise_variance: Float[np.ndarray, "*record signal"]
 ) -> Workbench:
     """Return the bench at a step at which its simulations (`stepped`) are as good as exact; itself if it is there.
 
@@ -274,7 +321,7 @@ def _scales(
     model: Model,
     candidate: Candidate,
     internal: Internal,
-    record: Record,
+    records: Sequence[Record],
     probes: Mapping[str, float],
     forces: Sequence[str],
 ) -> Scales:
@@ -282,13 +329,14 @@ def _scales(
         return float(np.max(np.abs(series))) if np.all(np.isfinite(series)) else 0.0
 
     signal = candidate.signal
-    value = record.inputs.get(signal, internal.values.get(signal, np.ones(1)))
+    inputs = {name: np.concatenate([record.inputs[name] for record in records]) for name in model.inputs}
+    value = inputs.get(signal, internal.values.get(signal, np.ones(1)))
     least = 0.0
     if candidate.effect.kind == "constant":
         # Of a constant, how large it can be.
         bounds = model.parameter(signal)
         value, least = np.array([bounds.lower, bounds.upper]), bounds.lower
-    context = {input_named(name): largest(series) for name, series in record.inputs.items()}
+    context = {input_named(name): largest(series) for name, series in inputs.items()}
     for name, series in internal.contexts.get(signal, {}).items():
         context[name] = largest(series)
         context |= {f"{name}{sign}": largest(np.maximum(side * series, 0.0)) for sign, side in (("+", 1), ("-", -1))}
@@ -297,10 +345,10 @@ def _scales(
         "value": largest(value),
         "least": least,
         "probe": next((probes[place] for place in (signal, *forces) if place in probes), _PROBE),
-        "duration": len(record) * record.sample_period,
-        "sample_period": record.sample_period,
+        "duration": duration_of(records),
+        "sample_period": min(record.sample_period for record in records),
         # Where the search begins; it goes where a residual leads it.
-        "frequencies": (2.0 * np.pi / record.sample_period / len(record),),
+        "frequencies": (2.0 * np.pi / duration_of(records),),
     }
 
 

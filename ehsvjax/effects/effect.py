@@ -77,7 +77,8 @@ class Effect:
             the model passes with the signal and `time` s, `step_size` s, `duration` s of the record. With a memory:
             `apply(own, value, context, memory)` returns the value and the new memory. For an input the value is the
             whole series `[time]`.
-        needs: names of quantities that the context must hold; the effect is no candidate where it does not.
+        needs: names of quantities that the context must hold; the effect is no candidate where it does not. One that
+            needs the `time` is of its run: in each of several records it has amplitudes of its own.
         memory: what it remembers at the start, scalars; NaN is a good mark for "nothing yet". The memory moves on once
             a step, by the value at its start.
         says: what it is, in half a sentence.
@@ -93,6 +94,11 @@ class Effect:
     memory: tuple[float, ...] = ()
     says: str = ""
     settled_by: str = ""
+
+    @property
+    def of_run(self) -> bool:
+        """Whether it goes by the clock of a record: its amplitudes then are others in every record."""
+        return "time" in self.needs
 
     @property
     def harmonic(self) -> bool:

@@ -1,7 +1,7 @@
 """What runs along the named signals of a model while it is simulated: values, and the context of each."""
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,10 +17,10 @@ from ehsvjax.simulate import grid_of, simulate
 
 
 class Internal(NamedTuple):
-    """Along one trajectory, `[time]`, SI: `values` of each signal, and the quantities of its context by name."""
+    """Along one trajectory, `[time]`, or several, SI: `values` of each signal, and of its context by quantity."""
 
-    values: dict[str, Float[np.ndarray, " time"]]
-    contexts: dict[str, dict[str, Float[np.ndarray, " time"]]]
+    values: dict[str, Float[np.ndarray, "*record time"]]
+    contexts: dict[str, dict[str, Float[np.ndarray, "*record time"]]]
 
 
 def internal_signals(
@@ -50,6 +50,23 @@ def internal_signals(
             values[signal] = seen[name]
             contexts.setdefault(signal, {})
     return Internal(values, contexts)
+
+
+def side_by_side(trajectories: Sequence[Internal]) -> Internal:
+    """Return several trajectories as `[record, time]`; the shorter ones stay where they end."""
+    first = trajectories[0]
+
+    def stacked(series):
+        longest = max(map(len, series))
+        return np.stack([np.pad(one, (0, longest - len(one)), mode="edge") for one in series])
+
+    return Internal(
+        {name: stacked([t.values[name] for t in trajectories]) for name in first.values},
+        {
+            signal: {name: stacked([t.contexts[signal][name] for t in trajectories]) for name in context}
+            for signal, context in first.contexts.items()
+        },
+    )
 
 
 def contexts_of(model: Model) -> dict[str, tuple[str, ...]]:

@@ -182,6 +182,7 @@ SENSOR = (
         "sensor",
         (amplitude("drift", "{value}", _small),),
         lambda own, y, context: y + own["drift"] * context["time"] / context["duration"],
+        needs=("time",),
         says="the sensor's zero moves as time passes",
         settled_by="the same level at the beginning and at the end, by a gauge",
     ),

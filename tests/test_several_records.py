@@ -1,0 +1,130 @@
+"""Several records in one diagnosis: of unlike length, period, noise and conditions, from independent plants."""
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnose import diagnose
+from tests.hidden_plants import held_levels, servovalve_with, van_der_pol_with
+
+KEY = jax.random.key(4)
+COEFFICIENT = 4e-3
+FORCE, FREQUENCY = 0.1, 2.0
+of_the_oscillator = pytest.mark.xdist_group("diagnoses of the oscillator")
+of_the_servovalve = pytest.mark.xdist_group("diagnoses of the servovalve")
+
+
+def oscillation(seed, levels, held, period, noise, name, **effects):
+    """A record of an oscillator with these effects."""
+    rng = np.random.default_rng(seed)
+    command = held_levels(rng, 1.0, levels, held)
+    position = van_der_pol_with([effects], command[None], period)["position"][0]
+    measured = position + noise * rng.standard_normal(len(command))
+    return ehsvjax.Record(period * np.arange(len(command)), {"command": command}, {"position": measured}, name=name)
+
+
+def valve_stroke(seed, supply_pressure, name, **effects):
+    """A record of a servovalve at a supply pressure that is known of it."""
+    rng = np.random.default_rng(seed)
+    command = held_levels(rng, 6e-3, 15, 100)
+    position = servovalve_with([effects], command[None], 1e-3, supply_pressure=supply_pressure)["position"][0]
+    measured = position + 1e-4 * rng.standard_normal(len(command))
+    time = 1e-3 * np.arange(len(command))
+    record = ehsvjax.Record(time, {"command": command}, {"position": measured}, name=name)
+    return record.at(supply_pressure=supply_pressure)
+
+
+def fitted(model, records):
+    return ehsvjax.identify(model, records, key=KEY, population=50, generations=20)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A spring that stiffens, in a long record and in a short one, noisier and of another period."""
+    effects = {"cubic_stiffness": {"coefficient": COEFFICIENT}}
+    records = [
+        oscillation(1, 30, 50, 0.02, 1e-2, "long", **effects),
+        oscillation(2, 15, 40, 0.025, 4e-2, "short", **effects),
+    ]
+    return records, diagnose(fitted(ehsvjax.van_der_pol(), records), records, key=KEY)
+
+
+@of_the_oscillator
+def test_records_of_unlike_length_period_and_noise_share_their_cause(bent):
+    records, found = bent
+    assert (found.verdict, found.causes) == ("named", ("cubic_stiffness",)), str(found)
+    error = found.extended.precision().standard_errors["cubic_stiffness.coefficient"]
+    assert abs(found.extended.parameters["cubic_stiffness.coefficient"]) == pytest.approx(COEFFICIENT, abs=4 * error)
+    assert found.records == tuple(records) and found.extended.records == tuple(records)
+    for record, outputs, noise in zip(records, found.misfit.by_record, (1e-2, 4e-2), strict=True):
+        assert outputs["position"].noise_floor == pytest.approx(noise, rel=0.1), record.name
+        assert len(outputs["position"].residual) == len(record)
+
+
+@of_the_oscillator
+def test_each_record_is_predicted_from_the_others(bent):
+    _, found = bent
+    assert found.gain.on == "each record, predicted from the others" and found.gain.records == ("long", "short")
+    for outputs, noise in zip(found.gain.by_record, (1e-2, 4e-2), strict=True):
+        assert outputs["position"].rmse_after == pytest.approx(noise, rel=0.2)
+        assert outputs["position"].rmse_before > outputs["position"].rmse_after
+    said = str(found)
+    assert said.startswith("Van der Pol oscillator on long and short: cubic_stiffness.")
+    assert "long, position: " in said and "short, position: " in said
+
+
+@of_the_oscillator
+def test_a_list_of_one_is_that_record(bent):
+    records, _ = bent
+    fit = fitted(ehsvjax.van_der_pol(), records[0])
+    one, listed = diagnose(fit, records[0], key=KEY), diagnose(fit, records[:1], [records[1]], key=KEY)
+    assert one.causes == listed.causes and one.table.equals(listed.table)
+    assert listed.gain.on == "short, which was not used"
+    assert "as it was fitted" not in str(one)
+    # How the fit predicts what it has not seen is said before anything is refitted.
+    other = diagnose(fit, records[1], key=KEY)
+    predicted = fit.score(records[1]).rmse["position"]
+    assert other.misfit.outputs["position"].rmse_predicted == pytest.approx(predicted, rel=1e-3)
+    assert f"rmse {predicted:.4g} as it was fitted; refitted rmse" in str(other)
+
+
+@of_the_oscillator
+def test_a_periodic_force_has_an_amplitude_of_its_own_in_every_record():
+    shaken = {"harmonic_force": {"force": FORCE, "frequency": FREQUENCY, "phase": 0.7}}
+    records = [
+        oscillation(3, 30, 50, 0.02, 1e-2, "shaken", **shaken),
+        oscillation(4, 30, 50, 0.02, 1e-2, "quiet"),
+    ]
+    found = diagnose(fitted(ehsvjax.van_der_pol(), records), records, key=KEY)
+    assert found.causes == ("harmonic_force",), str(found)
+    assert found.extended.parameters["harmonic_force.frequency"] == pytest.approx(FREQUENCY, rel=1e-2)
+    sizes = [
+        np.hypot(*(record.constants[f"harmonic_force.{part}"] for part in ("cosine", "sine")))
+        for record in found.extended.records
+    ]
+    assert sizes == [pytest.approx(FORCE, rel=0.1), pytest.approx(0.0, abs=0.1 * FORCE)]
+    # The extended model simulates each as it was, and what is of a run is absent in any other.
+    for record in found.extended.records:
+        assert found.extended.score(record).rmse["position"] == pytest.approx(1e-2, rel=0.1)
+    assert found.extended.score(records[0]).rmse["position"] > 2e-2
+
+
+@of_the_servovalve
+def test_what_one_record_cannot_tell_another_supply_pressure_settles():
+    load = {"constant_load": {"force": 800.0}}
+    full, half = valve_stroke(5, 140e5, "full", **load), valve_stroke(6, 70e5, "half", **load)
+    alone = diagnose(fitted(ehsvjax.servovalve(), full), full, key=KEY)
+    both = [full, half]
+    together = diagnose(fitted(ehsvjax.servovalve(), both), both, key=KEY)
+    assert alone.verdict == "ambiguous" and "constant_load" in alone.alternatives[0].causes, str(alone)
+    assert (together.verdict, together.causes) == ("named", ("constant_load",)), str(together)
+    assert together.extended.parameters["constant_load.force"] == pytest.approx(800.0, rel=0.1)
+
+
+@of_the_oscillator
+def test_records_of_unlike_hold_are_refused(bent):
+    records, found = bent
+    linear = ehsvjax.Record(records[0].time, records[0].inputs, records[0].outputs, hold="linear")
+    with pytest.raises(ValueError, match="expected records with one kind of hold"):
+        diagnose(found.fit, [records[0], linear], key=KEY)
