@@ -147,3 +147,38 @@ def record_of(period, inputs, outputs, noise, seed, name="bench", **about) -> eh
     noisy = {name: series + noise[name] * rng.standard_normal(len(series)) for name, series in outputs.items()}
     count = len(next(iter(inputs.values())))
     return ehsvjax.Record(np.arange(count) * period, inputs, noisy, name=name, **about)
+
+
+# --- A damper that is moved: its force acts in what is measured alone ---
+
+
+def damper() -> Model:
+    """Return a damper of viscous friction whose force is measured while it is moved."""
+
+    def start(parameters, initial, inputs):
+        del parameters, initial
+        return {"x": inputs["displacement"]}
+
+    def rates(parameters, state, inputs, signal):
+        del parameters
+        return {"x": (signal("displacement", inputs["displacement"]) - state["x"]) / 0.01}
+
+    def measure(parameters, state, inputs, signal):
+        velocity = (inputs["displacement"] - state["x"]) / 0.01
+        friction = signal("friction", 0.0, position=state["x"], velocity=velocity)
+        return {"force": signal("force", parameters["coefficient"] * velocity - friction)}
+
+    return Model(
+        name="damper",
+        parameters=(Parameter("coefficient", "c", "N s/m", 100.0, 10.0, 1e3, "log"),),
+        initial=(),
+        signals=(
+            Signal("displacement", "input", "m"),
+            Signal("friction", "force", "N"),
+            Signal("force", "sensor", "N"),
+        ),
+        start=start,
+        stepper=runge_kutta_4(rates),
+        measure=measure,
+        max_step=0.005,
+    )

@@ -6,13 +6,14 @@ import jax
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import lsim
 
 import ehsvjax
 from ehsvjax.diagnose import diagnose
 from ehsvjax.effects import BANK, attach, candidates
 from ehsvjax.effects.internal import contexts_of
 from tests.plants import held_levels
-from tests.small_models import OUTFLOW, PUMP, carriage, carriage_plant, record_of, tanks, tanks_plant
+from tests.small_models import OUTFLOW, PUMP, carriage, carriage_plant, damper, record_of, tanks, tanks_plant
 
 # One process compiles.
 pytestmark = pytest.mark.xdist_group("diagnoses of a carriage")
@@ -93,6 +94,17 @@ def test_an_input_that_runs_straight_from_value_to_value_is_a_hold():
     # Declared as it is, nothing is missing.
     straight = record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 5, hold="linear")
     assert diagnosed(carriage(), straight).verdict == "adequate"
+
+
+def test_a_force_that_acts_in_what_is_measured_alone_is_named():
+    # A damper that is moved: the lag is SciPy's, the friction is added to its force.
+    time = 0.01 * np.arange(1500)
+    moved = 0.1 * np.sin(2.0 * time) + 0.05 * np.sin(3.1 * time)
+    follows = lsim(([[-100.0]], [[100.0]], [[-100.0]], [[100.0]]), moved, time, X0=moved[0], interp=False)[1]
+    force = 200.0 * follows + 30.0 * np.sign(follows)
+    found = diagnosed(damper(), record_of(0.01, {"displacement": moved}, {"force": force}, {"force": 1.0}, 3))
+    assert found.causes == ("coulomb_friction",), str(found)
+    assert found.extended.parameters["coulomb_friction.force"] == pytest.approx(30.0, rel=0.02)
 
 
 def test_a_sensor_that_shows_a_part_of_the_input_at_once_is_named():

@@ -109,8 +109,8 @@ def _random_force(
         return None, False
     if selection.included:
         final = process_noise(bench, selection.final, selection.white)
-        assert final is not None
-        better = nominal.likelihood - final.of_sensor + _least_price(selection)
+        # Where no force shows any more, the causes have made it invisible.
+        better = -np.inf if final is None else nominal.likelihood - final.of_sensor + _least_price(selection)
         # A single cause that leaves nothing unexplained has the first word.
         single = innocent and len(selection.included) == 1
         if not better > (CONVINCING if single else 0.0):

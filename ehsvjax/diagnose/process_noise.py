@@ -34,7 +34,7 @@ class ProcessNoise(NamedTuple):
 
 
 def process_noise(bench: Workbench, final: Refits, white: Whitening) -> ProcessNoise | None:
-    """Compare a random force with noise of the sensor; None for several outputs, or a model without a force.
+    """Compare a random force with noise of the sensor; None for several outputs, or where no force shows.
 
     By the samples that are used for any other explanation too, as `white` says: likelihoods of others are no
     comparison.
@@ -53,6 +53,8 @@ def process_noise(bench: Workbench, final: Refits, white: Whitening) -> ProcessN
     parts = parts_at(bench, final.points[0], places[0])
     h = (parts.responses[..., 0] / deviation)[:, measured]
     h = h - (h @ known) @ known.T
+    if not h.any():
+        return None
     intensity, force = _likelihood_of_force(h, r)
     sensor = sum(
         _likelihood_of_sensor(np.where(there, one, 0.0)[None], there[None])

@@ -100,8 +100,9 @@ def rivals_again(
     ranked = []
     for own, group in zip(included, groups, strict=True):
         rest = tuple(j for j in included if j != own)
-        starts = [[r.refitted.points[0]] for r in group if r.candidate != own]
-        others = [r.candidate for r in group if r.candidate != own]
+        # Beside what has been swapped in for another cause, some have too many numbers.
+        able = [r for r in group if r.candidate != own and fits(trials.bench, (*rest, r.candidate))]
+        starts, others = [[r.refitted.points[0]] for r in able], [r.candidate for r in able]
         led = refit_sets(trials, starts, [(*rest, i) for i in others], white, race=True) if others else None
         found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
         ranked.append(_ranked(trials, own, {own: final} | found))

@@ -104,6 +104,9 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     def own_of(candidate, parameters):
         return {p.name: parameters[candidate.parameter(p.name)] for p in candidate.effect.parameters}
 
+    def added_by(series):
+        return {place: series[disturbance(place)] for place in places}
+
     def disturbing(parameters, signal, current):
         """Return the signal function with the effects behind it, at the moment that `current` holds."""
 
@@ -159,8 +162,7 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
         steady = None if drifting else base.stepper(parameters, step_size, disturbed)
 
         def step(state, series):
-            begin = series(0.0) if places else {}
-            added = {place: begin[disturbance(place)] for place in places}
+            added = added_by(series(0.0)) if places else {}
             # What depends on time is held over the step: at its middle that is right to second order.
             middle = (state.steps + 0.5) * step_size
             current[0] = _Moment(middle, step_size, state.memories, inside, added)
@@ -169,8 +171,9 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             following = once(state.state, series)
             time = (state.steps + 1) * step_size
             if sensing:
-                current[0] = _Moment(time, step_size, current[0].memories, sensing, values=series(1.0))
-                base.measure(now, following, series(1.0), disturbed)
+                ahead = series(1.0)
+                current[0] = _Moment(time, step_size, current[0].memories, sensing, added_by(ahead), ahead)
+                base.measure(now, following, ahead, disturbed)
             return ExtendedState(following, state.steps + 1, time, current[0].memories)
 
         return step
@@ -178,7 +181,7 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     def measure(parameters, state, series, signal):
         # The memories have moved on to this moment: no time is left for them to do so.
         parameters = corrected(parameters)
-        moment = _Moment(state.time, 0.0, state.memories, set(), values=series)
+        moment = _Moment(state.time, 0.0, state.memories, set(), added_by(series), series)
         disturbed = disturbing(parameters, signal, [moment])
         return base.measure(drifted(parameters, state.time), state.state, series, disturbed)
 

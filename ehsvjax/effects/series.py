@@ -61,7 +61,8 @@ def _lagged(own, series, context):
     def follow(level, target):
         return target + (level - target) * decay, target + (level - target) * share
 
-    return lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
+    lagging = lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
+    return jnp.where(own["time_constant"] > 0.0, lagging, series)
 
 
 def _play_along(own, series, context):
@@ -83,6 +84,8 @@ def _sensor_lag(own, value, context, memory):
     # With the slope of the line, what lags behind it is slope * time constant.
     share = jnp.where(ratio > 1e-3, (1.0 - decay) / jnp.maximum(ratio, 1e-3), 1.0 - 0.5 * ratio)
     level = decay * level + (share - decay) * before + (1.0 - share) * value
+    # Any lag shows what was before a value that jumps at this very moment, as an output does that depends on an input.
+    level = jnp.where(own["time_constant"] > 0.0, level, value)
     return level, (level, value)
 
 
