@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnose import Diagnosis, diagnose
 from tests.hidden_plants import held_levels, servovalve_with, van_der_pol_with
 
 KEY = jax.random.key(4)
@@ -72,6 +72,22 @@ def test_each_record_is_predicted_from_the_others(bent):
     said = str(found)
     assert said.startswith("Van der Pol oscillator on long and short: cubic_stiffness.")
     assert "long, position: " in said and "short, position: " in said
+
+
+@of_the_oscillator
+def test_several_records_are_drawn_reported_and_kept(bent, tmp_path):
+    records, found = bent
+    panels = found.plot().axes
+    assert "records one after the other" in panels[0].get_xlabel()
+    named = [text.get_text() for axes in panels if axes.get_legend() for text in axes.get_legend().get_texts()]
+    assert {"long", "short"} <= set(named)
+    found.report(tmp_path / "page.html")
+    page = (tmp_path / "page.html").read_text()
+    assert "on long and short" in page and "these records" in page and page.count("measured and simulated by") == 2
+    found.save(tmp_path / "found.npz")
+    again = Diagnosis.load(tmp_path / "found.npz")
+    assert str(again) == str(found) and [r.name for r in again.records] == [r.name for r in records]
+    assert again.extended.records[0] is again.records[0]
 
 
 @of_the_oscillator

@@ -16,6 +16,7 @@ from ehsvjax.plots import (
     _PREFIXES,
     _figure,
     _legend,
+    _plain,
     _prefix,
     _scaled,
     _style,
@@ -27,6 +28,10 @@ if TYPE_CHECKING:
 
 _SUSPECTS = 14
 _PANELS = 3
+# Score beyond which small ones are told apart on a logarithmic axis only.
+_FAR = 20.0
+# Of records in one panel.
+_MARKERS = "os^Dv"
 # Characters in a line of the title.
 _TITLE_WIDTH = 110
 
@@ -87,19 +92,24 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
     _legend(series)
     spectrum.set(xlabel="frequency (Hz)", ylabel=f"power ({unit}²/Hz)" if unit else "power (1/Hz)")
     _legend(spectrum)
-    for k, quantity in enumerate(_most_telling([m.against for m in found])):
-        axes = part.add_subplot(grid[1, k])
-        profiles = [m.against[quantity] for m in found if quantity in m.against]
+    for panel, quantity in enumerate(_most_telling([m.against for m in found])):
+        axes = part.add_subplot(grid[1, panel])
+        profiles = {k: m.against[quantity] for k, m in zip(there, found, strict=True) if quantity in m.against}
         across, across_label = _scaled(
-            np.concatenate([p.middle for p in profiles]), quantity_unit(diagnosis.fit.model, quantity)
+            np.concatenate([p.middle for p in profiles.values()]), quantity_unit(diagnosis.fit.model, quantity)
         )
-        mean, mean_label = _scaled(np.concatenate([p.mean for p in profiles]), unit)
-        for profile in profiles:
+        mean, mean_label = _scaled(np.concatenate([p.mean for p in profiles.values()]), unit)
+        for k, profile in profiles.items():
             axes.fill_between(
                 profile.middle / across, -1.96 * profile.deviation / mean, 1.96 * profile.deviation / mean,
                 color=_COMMAND, alpha=0.15, lw=0,
             )  # fmt: skip
-            axes.plot(profile.middle / across, profile.mean / mean, color=_MEASURED, marker="o", ms=4)
+            axes.plot(
+                profile.middle / across, profile.mean / mean, color=_MEASURED, marker=_MARKERS[k % len(_MARKERS)], ms=4,
+                label=_plain(diagnosis.records[k].name) if len(there) > 1 and not panel else None,
+            )  # fmt: skip
+        if len(there) > 1 and not panel:
+            _legend(axes)
         axes.axhline(0.0, color=_AXIS, lw=0.8)
         axes.set(xlabel=f"{_words(quantity)} {across_label}", ylabel=f"mean residual {mean_label}")
 
@@ -120,9 +130,11 @@ def _draw_suspects(axes, diagnosis: Diagnosis) -> None:
     table = table[np.isfinite(table["score"].astype(float))].drop_duplicates("cause").head(_SUSPECTS)[::-1]
     within = {name for a in diagnosis.alternatives for name in a.causes} | set(diagnosis.causes)
     colours = [_MODEL if cause in within else _MEASURED for cause in table["cause"]]
-    axes.barh(range(len(table)), np.abs(table["score"].astype(float)), color=colours)
+    scores = table["score"].astype(float).abs()
+    axes.barh(range(len(table)), scores, color=colours)
     axes.set_yticks(range(len(table)), [_words(cause) for cause in table["cause"]], fontsize=8)
-    axes.set_xscale("symlog", linthresh=5.0)
+    if scores.max() > _FAR:
+        axes.set_xscale("symlog", linthresh=5.0)
     axes.set(xlabel="score on the nominal model (standard deviations)", title="suspects")
     axes.grid(axis="y", visible=False)
 
