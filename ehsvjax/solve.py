@@ -95,6 +95,8 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     # A longer step may not know what a shorter one does, so that all readings are asked again. At one and the same step
     # what was left out stays out, lest readings come and go.
     asked = problem.samples
+    # The last start is the one with nominal initial conditions.
+    own, nominal_initial = len(problem.free), np.asarray(starts)[-1, len(problem.free) :]
     problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
     with jax.enable_x64(True):
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
@@ -113,6 +115,10 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
                 asked = known.samples
                 # Their weights alone are others: the best of the starts goes on.
                 starts = np.broadcast_to(starts[best], starts.shape)
+            # Where the first readings were left out, the initial conditions have gone anywhere: once these are asked
+            # again, there may be no way back.
+            starts = np.array(starts)
+            starts[-1] = np.concatenate([starts[best, :own], nominal_initial])
             same = known.substeps == before.substeps and np.array_equal(known.samples.measured, before.samples.measured)
             if same and (not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
                 break

@@ -14,6 +14,23 @@ SAMPLES = 2500
 KEY = jax.random.key(1)
 
 
+def test_initial_conditions_come_back_once_their_readings_count_again():
+    # Where the search begins the arithmetic does not know the first readings: without them initial conditions run to
+    # their bounds, and with a leakage that was given wrong nothing led back from there.
+    seed, given = 1111573466, 1e-11
+    command = np.repeat(np.random.default_rng([5, seed]).uniform(-6e-3, 6e-3, 25), 200)
+    motion = servovalve_plant(command, 1e-3, leakage_coefficient=0.396673 * given)
+    rng = np.random.default_rng([9, seed])
+    noisy = {name: getattr(motion, name) + NOISE[name] * rng.standard_normal(5000) for name in NOISE}
+    record = ehsvjax.Record(1e-3 * np.arange(5000), {"command": command}, noisy)
+    fit = ehsvjax.identify(
+        ehsvjax.servovalve(leakage_coefficient=given), record, key=jax.random.key(seed), population=50, generations=20,
+        bounds={"flow_gain": (3e-5, 6e-4)},
+    )  # fmt: skip
+    assert not [warning for warning in fit.warnings if "bound" in warning], fit.warnings
+    assert abs(fit.initial[0]["initial_filtered"]) < 2e-3
+
+
 @pytest.fixture(scope="module")
 def diagnosis():
     # The first half of a record in which a lag of the pressure's sensor was seen.
