@@ -34,7 +34,7 @@ def differences(
     return np.where(np.isnan(measured) | np.isfinite(simulated), measured - simulated, np.inf)
 
 
-def score_of(records: Sequence[Record], residuals: Sequence[Mapping[str, Float[np.ndarray, " time"]]]) -> Score:
+def score_of(records: Sequence[Record], residuals: Sequence[Mapping[str, Float[np.ndarray, "..."]]]) -> Score:
     """Return the score of each output over records; a missing reading counts for nothing."""
     names = dict.fromkeys(name for record in records for name in record.outputs)
     rmse, fit_percent, cost = {}, {}, {}
