@@ -7,6 +7,7 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnose import Diagnosis, diagnose
 from tests.hidden_plants import held_levels, servovalve_with, van_der_pol_with
+from tests.small_models import STIFFNESS, carriage, carriage_plant, record_of
 
 KEY = jax.random.key(4)
 COEFFICIENT = 4e-3
@@ -124,6 +125,25 @@ def test_a_periodic_force_has_an_amplitude_of_its_own_in_every_record():
     for record in found.extended.records:
         assert found.extended.score(record).rmse["position"] == pytest.approx(1e-2, rel=0.1)
     assert found.extended.score(records[0]).rmse["position"] > 2e-2
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("held", [("position", "velocity"), ("velocity", "position")])
+def test_a_record_may_hold_outputs_that_another_does_not(held):
+    push = held_levels(np.random.default_rng(8), 20.0, 12, 50)
+    noise = {"position": 2e-3, "velocity": 2e-2}
+    states = dict(zip(noise, carriage_plant(push, 0.02, stiffness=1.3 * STIFFNESS).T, strict=True))
+    records = [
+        record_of(0.02, {"push": push}, {n: states[n] for n in some}, noise, seed, f"bench {seed}")
+        for seed, some in enumerate([held[:1], held])
+    ]
+    found = diagnose(fitted(carriage(), records), records, key=KEY)
+    assert "stiffness" in found.causes, str(found)
+    assert [set(outputs) for outputs in found.misfit.by_record] == [set(held[:1]), set(held)]
+    assert [set(outputs) for outputs in found.gain.by_record] == [set(held[:1]), set(held)]
+    for outputs in found.misfit.by_record:
+        for name, output in outputs.items():
+            assert output.noise_floor == pytest.approx(noise[name], rel=0.15)
 
 
 @of_the_servovalve

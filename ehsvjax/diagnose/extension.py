@@ -31,9 +31,9 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> F
 
     """
     bench = selection.bench
-    records = bench.records
+    records, names = bench.records, bench.problem.names
     refits = _unweighted(selection, refits, included)
-    values = dict(zip(bench.column, to_values(bench.problem.coordinates, refits.points[0]), strict=True))
+    values = dict(zip(names, to_values(bench.problem.coordinates, refits.points[0]), strict=True))
     values |= {f"{n}[{k}]": v for n, known in bench.problem.known_initial.items() for k, v in enumerate(known)}
     initial = [{p.name: float(values[f"{p.name}[{k}]"]) for p in bench.fit.model.initial} for k in range(len(records))]
     # In the order of the bank, in which they act one after another at a signal.
@@ -43,7 +43,7 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> F
     for candidate in attached:
         scales = bench.scales[candidate.name]
         for number, column in bench.unknowns_of(candidate):
-            name, named = candidate.parameter(number.name), bench.problem.names[column]
+            name, named = candidate.parameter(number.name), names[column]
             value = float(values[named])
             lower, upper = number.lower(scales), number.upper(scales)
             reach = _REACH * abs(value) or bench.problem.coordinates.upper[column]

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from ehsvjax.diagnose.noise import Whitening
 from ehsvjax.diagnose.parts import Parts, parts_at
 from ehsvjax.diagnose.refits import Refits, unexplained
-from ehsvjax.diagnose.workbench import Workbench
+from ehsvjax.diagnose.workbench import Workbench, duration_of
 from ehsvjax.effects.effect import Candidate, Scales
 
 # Frequencies of each effect that are tried.
@@ -34,7 +34,7 @@ def parts_of(bench: Workbench) -> dict[str, Parts]:
 
 def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts: Mapping[str, Parts]) -> Workbench:
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
-    duration = float(np.max(bench.present.sum(axis=1) * bench.problem.samples.sample_period))
+    duration = duration_of(bench.records)
     known, r = unexplained(current, white)
     scales: dict[str, Scales] = {}
     for candidate in bench.candidates:
@@ -50,7 +50,8 @@ def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts:
             frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration)
             peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, white, known, r, there))
             lowest = edge
-        for k in range(len(bench.records)):
+        # A record that does not hold the first output says nothing of it.
+        for k in np.flatnonzero(bench.problem.samples.measured[..., 0].any(axis=1)).tolist():
             peaks += _peaks(*_periodogram(bench, current, k, lowest, highest))
         scales[candidate.name] = {**own, "frequencies": _strongest(peaks, duration) or own["frequencies"]}
     return replace(bench, scales={**bench.scales, **scales})

@@ -77,13 +77,13 @@ class Workbench:
     differences: Float[np.ndarray, " parameter"]
     sketched_at: int
 
-    @property
+    @functools.cached_property
     def base_columns(self) -> list[int]:
         """Columns of the nominal model's unknowns, initial conditions included."""
         own = {j for c in self.candidates for j in self.columns_of(c)}
         return [j for j in range(len(self.nominal)) if j not in own]
 
-    @property
+    @functools.cached_property
     def present(self) -> Bool[np.ndarray, "record time"]:
         """Where the records have samples: the shorter ones are filled up."""
         lengths = np.array([len(record) for record in self.records])
