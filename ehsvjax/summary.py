@@ -155,7 +155,7 @@ def _integration(step_size: float, effort: Effort) -> str:
         words.append(f"worth {_worth(effort.arithmetic)}")
     if effort.left_out:
         readings = "1 reading" if effort.left_out == 1 else f"{effort.left_out} readings"
-        words.append(f"{readings} beside jumps left out")
+        words.append(f"{readings} that it cannot know left out")
     return "; ".join(words)
 
 

@@ -117,10 +117,10 @@ def test_effort_is_told_as_it_was():
     ("effort", "words"),
     [
         ({"step_size": 2.5e-4, "arithmetic": 0.0096, "left_out": 53},
-         "steps of 0.25 ms; worth 0.0096 noise variances; 53 readings beside jumps left out"),
+         "steps of 0.25 ms; worth 0.0096 noise variances; 53 readings that it cannot know left out"),
         ({"step_size": 0.02, "arithmetic": 3e-9}, "steps of 20 ms; worth less than 0.001 noise variances"),
         ({"step_size": 7.8125e-7, "arithmetic": 312.4, "left_out": 1},
-         "steps of 0.781 µs; worth 3.1e+02 noise variances; 1 reading beside jumps left out"),
+         "steps of 0.781 µs; worth 3.1e+02 noise variances; 1 reading that it cannot know left out"),
         ({"step_size": 1.0, "arithmetic": math.inf},
          "steps of 1 s; worth more than can be said, half a step is not finite"),
         ({"step_size": 5e-6}, "steps of 5 µs"),
