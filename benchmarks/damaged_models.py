@@ -87,10 +87,15 @@ def with_rates(rates) -> Model:
 
 def with_step(following) -> Model:
     """Return a tank whose step returns `following(state)`."""
+    return with_whole_step(lambda state, inputs: following(state))
+
+
+def with_whole_step(following) -> Model:
+    """Return a tank whose step returns `following(state, inputs)`."""
 
     def stepper(parameters, step_size, signal):
         signal("flow", 0.0)
-        return lambda state, inputs: following(state)
+        return following
 
     return tank(stepper=stepper)
 
@@ -167,6 +172,7 @@ FAULTS = {
     "step of other keys": lambda: with_step(lambda state: {"volume": state["level"]}),
     "step of another shape": lambda: with_step(lambda state: {"level": jnp.ones(3) * state["level"]}),
     "step to whole numbers": lambda: with_step(lambda state: {"level": jnp.int32(1)}),
+    "step with inputs as they are": lambda: with_whole_step(lambda state, inputs: {"level": inputs["command"]}),
     "step to None": lambda: with_step(lambda state: None),
     "step that is no function": lambda: tank(stepper=lambda parameters, step_size, signal: 3.0),
     "start that is an array": lambda: with_start(lambda initial: {"level": jnp.zeros(3)}),

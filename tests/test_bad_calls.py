@@ -76,6 +76,10 @@ def test_what_is_harmless_works():
             "a rate more",
             r"expected the rates that .* returns to be like the state, \{'level': a number\}, got \{.*other",
         ),
+        (
+            "step with inputs as they are",
+            r"TypeError .* in .*\(damaged_models.py, line \d+\): a step asks for its inputs by the share",
+        ),
         ("step of another shape", r"expected the state one step later, .*, got \{'level': an array \(3,\)\}"),
         ("an output missing", r"to return a number for each output, level; got none"),
         ("an output too many", r"to return a number for each output, level; got level, flow"),

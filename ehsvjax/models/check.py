@@ -27,6 +27,7 @@ _CONVERSION = (
     "leave out float() and int(), and call jnp.sin, ... in place of math.sin: values are known only when it runs"
 )
 _NAMES = "use the names of the model's parameters, initial conditions, inputs and state"
+_INPUTS = "a step asks for its inputs by the share of it that has passed: inputs(0.5) are those halfway"
 # What an exception is, a part of its words, and what to do.
 _REMEDIES = (
     (jax.errors.TracerBoolConversionError, "", _CONDITION),
@@ -34,6 +35,7 @@ _REMEDIES = (
     (ValueError, "array element with a sequence", _NUMPY),
     (jax.errors.ConcretizationTypeError, "", _CONVERSION),
     (TypeError, "integer scalar arrays", _CONVERSION),
+    (TypeError, "'function' object is not subscriptable", _INPUTS),
     (KeyError, "", _NAMES),
 )
 
