@@ -89,13 +89,13 @@ def with_nominal_initial(problem: Problem, model: Model, individual) -> Float[np
 def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refined, int, Problem]:
     """Refine; then, while weights, step or readings that are known change, refine again with those found there.
 
-    With one output and squared residuals its weight does not move the minimum. The number returned says how many starts
-    came to the same minimum.
+    With one output and squared residuals its weight does not move the minimum. The last of the starts has nominal
+    initial conditions if any are free, as `candidates` gives them. The number returned says how many starts came to the
+    same minimum.
     """
     # A longer step may not know what a shorter one does, so that all readings are asked again. At one and the same step
     # what was left out stays out, lest readings come and go.
     asked = problem.samples
-    # The last start is the one with nominal initial conditions.
     own, nominal_initial = len(problem.free), np.asarray(starts)[-1, len(problem.free) :]
     problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
     with jax.enable_x64(True):
@@ -115,10 +115,10 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
                 asked = known.samples
                 # Their weights alone are others: the best of the starts goes on.
                 starts = np.broadcast_to(starts[best], starts.shape)
-            # Where the first readings were left out, the initial conditions have gone anywhere: once these are asked
-            # again, there may be no way back.
-            starts = np.array(starts)
-            starts[-1] = np.concatenate([starts[best, :own], nominal_initial])
+            if problem.free_initial:
+                # Where the first readings were left out, the initial conditions have gone anywhere: once these are
+                # asked again, there may be no way back.
+                starts = np.vstack([starts[:-1], np.concatenate([starts[best, :own], nominal_initial])])
             same = known.substeps == before.substeps and np.array_equal(known.samples.measured, before.samples.measured)
             if same and (not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
                 break
