@@ -18,7 +18,7 @@ def test_initial_conditions_come_back_once_their_readings_count_again():
     # Where the search begins the arithmetic does not know the first readings: without them initial conditions run to
     # their bounds, and with a leakage that was given wrong nothing led back from there.
     seed, given = 1111573466, 1e-11
-    command = np.repeat(np.random.default_rng([5, seed]).uniform(-6e-3, 6e-3, 25), 200)
+    command = held_levels([5, seed], 6e-3, 25, 200)
     motion = servovalve_plant(command, 1e-3, leakage_coefficient=0.396673 * given)
     rng = np.random.default_rng([9, seed])
     noisy = {name: getattr(motion, name) + NOISE[name] * rng.standard_normal(5000) for name in NOISE}
@@ -60,7 +60,8 @@ def test_the_print_says_the_step_and_the_readings_that_are_left_out(diagnosis):
     step, left_out, _ = diagnosis.integration
     text = str(diagnosis)
     assert f"simulated in steps of {1e3 * step:.3g} ms" in text
-    assert f"cannot know, as beside a jump, carry no weight: {left_out['load_pressure']} of load_pressure" in text
+    of_load_pressure = f"{left_out['load_pressure']} of load_pressure"
+    assert f"readings that it cannot know, as beside a jump, carry no weight: {of_load_pressure}" in text
 
 
 def test_what_is_left_out_does_not_count_for_the_gain(diagnosis):

@@ -32,11 +32,11 @@ def integration_line(diagnosis: "Diagnosis") -> str:
     """Return at which step all was simulated, and what that is worth."""
     step, left_out, worth = diagnosis.integration
     readings = " and ".join(f"{count} of {name}" for name, count in left_out.items() if count)
-    beside = f"; readings that it cannot know, as beside a jump, carry no weight: {readings}" if readings else ""
+    unknown = f"; readings that it cannot know, as beside a jump, carry no weight: {readings}" if readings else ""
     much = "" if worth < 1.0 else ": more than it should; simulate the model with a method for stiff equations"
     return (
         f"simulated in steps of {1e3 * step:.3g} ms: at half of it no comparison changes by more than "
-        f"{max(worth, 0.01):.2g} noise variances{much}{beside}"
+        f"{max(worth, 0.01):.2g} noise variances{much}{unknown}"
     )
 
 
