@@ -131,27 +131,25 @@ def noise_outside(
     for k, i in channels:
         deviation[k, 0, i] = _deviation(residual[k, :, i][measured[k, :, i]])
     standardised = np.where(measured, residual, 0.0) / deviation
-    basis = _basis(np.where(measured, responses, 0.0) / deviation)
-    left = standardised - _combined(basis, standardised)
-    # Directions that were taken of each output, a share of one where it is in several.
-    taken = np.sum(basis**2, axis=(1, 2))
-    variances = np.sum(left**2, axis=1) / np.maximum(measured.sum(axis=1) - taken, 1.0)
-    noises = {channel: _white(variances[channel]) for channel in channels}
 
     def of(series, channel):
         k, i = channel
         return series[k : k + 1, ..., i]
 
+    directions = _basis(np.where(measured, responses, 0.0) / deviation)
+    basis = {c: of(directions, c).copy() for c in channels}
+    coefficients = np.sum([np.tensordot(of(standardised, c), basis[c], 2) for c in channels], axis=0)
+    left = {c: of(standardised, c) - basis[c] @ coefficients for c in channels}
+    # Directions that were taken of each output, a share of one where it is in several.
+    taken = {c: float(np.vdot(basis[c], basis[c])) for c in channels}
+    noises = {
+        c: _white(float(np.sum(left[c] ** 2)) / max(float(of(measured, c).sum()) - taken[c], 1.0)) for c in channels
+    }
     # What the projection took of the noise depends on the noise, first taken to be white: a few rounds settle it.
     for _ in range(4):
-        inside = np.sum([meat(of(basis, c), noise) for c, noise in noises.items()], axis=0)
-        absorbed = {
-            c: absorbed_by_the_fit(of(basis, c), of(measured, c), noise, np.eye(basis.shape[-2]), inside)
-            for c, noise in noises.items()
-        }
-        noises = {
-            c: residual_noise(of(left, c), of(measured, c), "auto", absorbed[c], float(taken[c])) for c in channels
-        }
+        inside = np.sum([meat(basis[c], noise) for c, noise in noises.items()], axis=0)
+        absorbed = {c: absorbed_by_the_fit(basis[c], of(measured, c), noise, inside) for c, noise in noises.items()}
+        noises = {c: residual_noise(left[c], of(measured, c), "auto", absorbed[c], taken[c]) for c in channels}
         if not any(len(noise.coefficients) for noise in noises.values()):
             break
 
@@ -176,11 +174,6 @@ def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
     kept = order[squares[order] > _NEGLIGIBLE**2 * squares[-1]]
     vectors = (combinations[:, kept] / np.sqrt(squares[kept])).T @ flat
     return np.moveaxis(vectors.reshape(-1, *shape), 0, 2)
-
-
-def _combined(basis, residual):
-    coefficients = np.einsum("rtds,rts->d", basis, residual)
-    return np.einsum("rtds,d->rts", basis, coefficients)
 
 
 def _deviation(values) -> float:

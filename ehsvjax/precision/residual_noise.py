@@ -98,30 +98,28 @@ def _correlated(
 
 
 def absorbed_by_the_fit(
-    jacobian: Float[np.ndarray, "record time parameter"],
+    basis: Float[np.ndarray, "record time direction"],
     measured: Bool[np.ndarray, "record time"],
     noise: ResidualNoise,
-    bread: Float[np.ndarray, "parameter parameter"],
-    inside: Float[np.ndarray, "parameter parameter"],
+    inside: Float[np.ndarray, "direction direction"],
 ) -> Float[np.ndarray, " lag"]:
     """Return how far the autocovariance of residuals lies below the noise's, as parameters were fitted to it.
 
-    With H = J B J^T the residuals have the covariance (I - H) Sigma (I - H). A noise so slow that it is like few
+    With H = Q Q^T the residuals have the covariance (I - H) Sigma (I - H). A noise so slow that it is like few
     independent samples loses more than the parameters' share of the samples.
 
     Args:
-        jacobian: rows without a sample are zero.
+        basis: Q of one output, whose columns are orthonormal over all outputs; rows without a sample are zero.
         measured: where there is a sample.
         noise: of this output.
-        bread: B, the inverse of J^T J over all outputs.
-        inside: J^T Sigma J over all outputs.
+        inside: Q^T Sigma Q over all outputs.
 
     """
-    through = np.where(measured[..., None], _correlated(jacobian, noise), 0.0)
-    taken, once = jacobian @ bread, through @ bread
-    twice = taken @ inside @ bread
+    through = np.where(measured[..., None], _correlated(basis, noise), 0.0)
     lags = lags_tried(int(measured.sum()))
-    return _autocovariance(taken, through, measured, lags) + _autocovariance(once - twice, jacobian, measured, lags)
+    return _autocovariance(basis, through, measured, lags) + _autocovariance(
+        through - basis @ inside, basis, measured, lags
+    )
 
 
 def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
@@ -144,12 +142,14 @@ def lags_tried(count: int) -> int:
 def _autocovariance(first, second, measured, lags: int) -> Float[np.ndarray, " lag"]:
     """Return the mean product of two sequences, the second later by 0 to `lags`; zero where nothing is measured."""
     length = measured.shape[1]
+    # Slices in time are then in one piece, and are multiplied where they lie.
+    first, second = np.ascontiguousarray(first), np.ascontiguousarray(second)
     covariance = []
     for lag in range(min(lags, length - 1) + 1):
         pairs = np.sum(measured[:, : length - lag] & measured[:, lag:])
         # Over all samples, not over the pairs: the sequence then stays positive definite where nothing is missing.
         share = pairs / max(np.sum(measured), 1) if measured.all() else 1.0
-        product = np.tensordot(first[:, : length - lag], second[:, lag:], first.ndim)
+        product = sum(np.vdot(a[: length - lag], b[lag:]) for a, b in zip(first, second, strict=True))
         covariance.append(product / max(pairs, 1) * share)
     return np.array(covariance)
 

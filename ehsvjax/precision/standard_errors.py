@@ -220,15 +220,19 @@ def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
 def _with_what_the_fit_took(found: Sensitivities, influence, noises: list[ResidualNoise]) -> list[ResidualNoise]:
     """Return the noises estimated again from autocovariances to which what the fit absorbed is added back."""
     bread, _ = bread_of(found)
-    jacobian = np.where(found.measured[..., None], found.jacobian, 0.0)
+    # Of the inverse of J^T J: J times this root has orthonormal columns.
+    scale = np.sqrt(np.maximum(np.diag(bread), 1e-300))
+    squares, directions = np.linalg.eigh(bread / scale[:, None] / scale)
+    root = scale[:, None] * directions * np.sqrt(np.maximum(squares, 0.0))
+    basis = np.where(found.measured[..., None], found.jacobian, 0.0) @ root
     for _ in range(2):
-        inside = _inside(found, noises) * _mean_variance(found, noises)
+        inside = root.T @ _inside(found, noises) @ root * _mean_variance(found, noises)
         noises = [
             residual_noise(
                 influence[..., i],
                 found.measured[..., i],
                 "coloured" if len(noise.coefficients) else "white",
-                absorbed_by_the_fit(jacobian[:, :, i], found.measured[..., i], noise, bread, inside),
+                absorbed_by_the_fit(basis[:, :, i], found.measured[..., i], noise, inside),
             )._replace(p_value=noise.p_value)
             for i, noise in enumerate(noises)
         ]
