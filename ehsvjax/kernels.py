@@ -53,7 +53,7 @@ _COMPILED_INSIDE = frozenset(
 )
 _FREE = frozenset(("broadcast_in_dim", "convert_element_type", "copy", "reshape", "squeeze", "stack"))
 _CALLS = frozenset(("closed_call", "jit"))
-_DEAR = {"div": 6, "sqrt": 8, "rsqrt": 8} | dict.fromkeys(
+_DEAR = {"div": 6, "sqrt": 8, "rsqrt": 8, "cond": 30} | dict.fromkeys(
     ("atan2", "cbrt", "cos", "erf", "exp", "expm1", "log", "log1p", "logistic", "pow", "sin", "tan", "tanh"), 20
 )
 

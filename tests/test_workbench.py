@@ -1,5 +1,7 @@
 """The trials' workbench: what it simulates side by side, against JAX's own derivatives."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +14,7 @@ from ehsvjax.diagnose.refits import padded, refit
 from ehsvjax.diagnose.screening import Screened
 from ehsvjax.diagnose.selection import _look, _weighed
 from ehsvjax.diagnose.trials import refit_screened, refit_sets, trials_of
-from ehsvjax.diagnose.workbench import workbench
+from ehsvjax.diagnose.workbench import _simulated, workbench
 from ehsvjax.effects import BANK
 from ehsvjax.population import cast, simulated
 
@@ -66,6 +68,57 @@ def test_points_are_simulated_alike_alone_and_among_many(bench):
     together = bench.simulated(points, added)
     for i in (0, 15, 16, 36):
         np.testing.assert_array_equal(bench.simulated(points[i : i + 1], added[i : i + 1])[0], together[i])
+
+
+def with_each_effect(bench):
+    """Return a point for each candidate, with it alone, as large as it is tried first."""
+    points = np.repeat(bench.nominal[None], len(bench.candidates), axis=0)
+    for point, candidate in zip(points, bench.candidates, strict=True):
+        for number, j in bench.unknowns_of(candidate):
+            tried = number.tries(bench.scales[candidate.name])
+            point[j] = tried[0] / bench.problem.coordinates.upper[j]
+    return points
+
+
+def differ_by_rounding_alone(bench):
+    """Whether effects that are skipped where they are absent leave what they leave where all are computed."""
+    points = with_each_effect(bench)
+    with jax.enable_x64(True):
+        problem = cast(bench.problem, jnp.float64)
+        every = np.asarray(jax.jit(jax.vmap(lambda point: simulated(problem, point)))(jnp.asarray(points)))
+    for point, expected in zip(points, every, strict=True):
+        # The corners of edges that are rounded have a width of a nanometre where they are sharp.
+        np.testing.assert_allclose(bench.simulated(point[None])[0], expected, rtol=0, atol=1e-7 * np.std(expected))
+    # And each does something, were it only a little.
+    assert (np.max(np.abs(every - bench.simulated(bench.nominal[None])), axis=(1, 2, 3)) > 0).all()
+
+
+def test_effects_that_are_absent_are_skipped_and_those_that_act_are_not(bench):
+    differ_by_rounding_alone(bench)
+
+
+def test_at_a_servovalve_too_effects_are_skipped_only_where_they_are_absent():
+    bench = workbench(*valve_fitted(max_step=2.5e-4), BANK)
+    differ_by_rounding_alone(bench)
+
+
+def valve_fitted(max_step):
+    """Return a fit of a servovalve with a step of the user's, and its records."""
+    model = replace(ehsvjax.servovalve(), max_step=max_step)
+    command = np.repeat(np.random.default_rng(3).uniform(-5e-3, 5e-3, 10), 30)
+    record = ehsvjax.Record(1e-3 * np.arange(300), {"command": command})
+    position = ehsvjax.simulate(model, record)["position"]
+    noisy = position + 1e-4 * np.random.default_rng(4).standard_normal(300)
+    record = replace(record, outputs={"position": noisy})
+    return ehsvjax.identify(model, record, key=jax.random.key(0), population=16, generations=2), [record]
+
+
+def test_another_step_is_no_other_program():
+    before = [workbench(*valve_fitted(max_step), BANK) for max_step in (1e-4, 2.5e-4)]
+    before[0].simulated(before[0].nominal[None])
+    compiled = _simulated._cache_size()
+    before[1].simulated(before[1].nominal[None])
+    assert _simulated._cache_size() == compiled
 
 
 @pytest.mark.parametrize("place", ["force", "position"])

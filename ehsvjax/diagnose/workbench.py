@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax import arithmetic
 from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates, input_named
-from ehsvjax.effects.extended import disturbance, extended
+from ehsvjax.effects.extended import disturbance, effects_in_the_loop, extended, switch
 from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
 from ehsvjax.effects.of_model import effects_for
 from ehsvjax.fit import Fit
@@ -140,7 +140,8 @@ class Workbench:
             # The setting is that of a thread.
             with jax.enable_x64(True):
                 filled = jnp.asarray(_filled(some, _ABREAST))
-                return np.asarray(_simulated(problem, filled, jnp.asarray(added)))[: len(some)]
+                acting = replace(problem, known=problem.known | self._acting(some))
+                return np.asarray(_simulated(acting, filled, jnp.asarray(added)))[: len(some)]
 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             every = np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
@@ -148,11 +149,27 @@ class Workbench:
         every[:, ~self.present] = 0.0
         return every
 
+    def _acting(self, points: Float[np.ndarray, "individual parameter"]) -> dict[str, np.float64]:
+        """Return for each switch of the model whether some of the points have an effect there."""
+        present = np.any(points != self.nominal, axis=0)
+        return {name: np.float64(present[columns].any()) for name, columns in self._sizes_at.items()}
+
+    @functools.cached_property
+    def _sizes_at(self) -> dict[str, list[int]]:
+        """Columns of the numbers that make effects vanish, by the switch that skips these effects."""
+        return {
+            switch(signal): [j for c in some for number, j in self.unknowns_of(c) if number.absent is not None]
+            for signal, some in effects_in_the_loop(self.candidates).items()
+        }
+
     @functools.cached_property
     def _on_device(self) -> Problem:
-        """The problem in double precision: to copy it for every simulation would take as long as some of them."""
+        """The problem in double precision: to copy it for every simulation would take as long as some of them.
+
+        How many integration steps a sample had in the fit is nothing that another program has to be compiled for.
+        """
         with jax.enable_x64(True):
-            return cast(self.problem, jnp.float64)
+            return cast(replace(self.problem, grid=self.problem.grid._replace(substeps=1)), jnp.float64)
 
     def stepped(self, points: Float[np.ndarray, "individual parameter"]) -> arithmetic.OutputsAt:
         """Return the outputs of some points by integration steps per sample, each simulated once."""
@@ -213,9 +230,12 @@ def workbench(fit: Fit, records: Sequence[Record], bank: Sequence[Effect]) -> Wo
 
     """
     initial = [fit.initial_of(record) for record in records]
+    internal = side_by_side(
+        [internal_signals(fit.model, r, fit.parameters, start) for r, start in zip(records, initial, strict=True)]
+    )
     # How much a force moves depends on the machine: on a larger one a probe of any fixed size is lost in rounding.
-    probes = _calibrated(_bench(fit, records, initial, bank, {}))
-    return _bench(fit, records, initial, bank, probes)
+    probes = _calibrated(_bench(fit, records, initial, internal, bank, {}))
+    return _bench(fit, records, initial, internal, bank, probes)
 
 
 def _calibrated(bench: Workbench) -> dict[str, float]:
@@ -237,14 +257,12 @@ def _bench(
     fit: Fit,
     records: Sequence[Record],
     initial: Sequence[Mapping[str, float]],
+    internal: Internal,
     bank: Sequence[Effect],
     probes: Mapping[str, float],
 ) -> Workbench:
     """Return the bench before its step is settled, with the probes that are known."""
     model = fit.model
-    internal = side_by_side(
-        [internal_signals(model, r, fit.parameters, start) for r, start in zip(records, initial, strict=True)]
-    )
     observed = observed_outputs(model, records)
     found = candidates(model, (*bank, *effects_for(model)), internal.contexts, observed)
     places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
@@ -253,7 +271,7 @@ def _bench(
     scales = {c.name: _scales(model, c, internal, records, probes, forces) for c in found}
     duration = duration_of(records)
     numbers = {c.parameter(p.name): _free(c, p, model, scales[c.name]) for c in found for p in c.effect.parameters}
-    full = extended(model, found, numbers, duration, places)
+    full = extended(model, found, numbers, duration, places, switched=True)
     quiet = [{disturbance(place): np.zeros(len(record)) for place in places} for record in records]
     of_run = [
         c.parameter(p.name) for c in found if c.effect.of_run for p in c.effect.parameters if p.absent is not None

@@ -1,11 +1,14 @@
 """A model with effects attached: a model like any other."""
 
 import functools
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 
 from ehsvjax.checks import instance
 from ehsvjax.effects.effect import Candidate, input_named
@@ -33,6 +36,7 @@ def extended(
     parameters: Mapping[str, Parameter],
     duration: float,
     disturbed: Sequence[str] = (),
+    switched: bool = False,
 ) -> Model:
     """Return the model with effects attached at its signals.
 
@@ -46,12 +50,19 @@ def extended(
         duration: s over which drifts are counted.
         disturbed: signals to which a series of any form can be added: the model has an input `disturbance(name)` for
             each of them.
+        switched: whether the effects at a signal can be skipped: the model has a constant `switch(name)` for each
+            signal that effects act on in the time loop; where it is zero they are not computed.
 
     """
-    equations = _equations(model.equations, tuple(attached), tuple(disturbed))
-    constants = () if any(p.name == DURATION for p in model.parameters) else (
+    equations = _equations(model.equations, tuple(attached), tuple(disturbed), switched)
+    constants = [] if any(p.name == DURATION for p in model.parameters) else [
         Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True, certain=True),
-    )  # fmt: skip
+    ]  # fmt: skip
+    if switched:
+        constants += [
+            Parameter(switch(name), "on", "", 1.0, 0.0, 1.0, fixed=True, certain=True)
+            for name in effects_in_the_loop(attached)
+        ]
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
     # An end stop on either side is the same effect twice.
     names = tuple(dict.fromkeys([*effects_of(model), *(c.name for c in attached)]))
@@ -75,6 +86,20 @@ def disturbance(signal: str) -> str:
     return f"disturbance of {signal}"
 
 
+def switch(signal: str) -> str:
+    """Name of the constant that is zero where no effect acts at a signal."""
+    return f"effects at {signal}"
+
+
+def effects_in_the_loop(attached: Sequence[Candidate]) -> dict[str, list[Candidate]]:
+    """Return the effects that are computed in every step, by the signal at which they act."""
+    at_signal: dict[str, list[Candidate]] = {}
+    for candidate in attached:
+        if candidate.effect.kind not in ("input", "parameter", "constant"):
+            at_signal.setdefault(candidate.signal, []).append(candidate)
+    return at_signal
+
+
 def effects_of(model: Model) -> tuple[str, ...]:
     """Return the names of the effects that a model was extended by.
 
@@ -87,7 +112,7 @@ def effects_of(model: Model) -> tuple[str, ...]:
 
 
 @functools.cache
-def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[str, ...]) -> Equations:
+def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[str, ...], switched: bool) -> Equations:
     """Return the equations with effects, the same objects for the same effects."""
     inputs = tuple(c for c in attached if c.effect.kind == "input")
     given_wrong = tuple(c for c in attached if c.effect.kind == "constant")
@@ -95,11 +120,9 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     remembering = tuple(c for c in attached if c.effect.memory and c.effect.kind != "input")
     sensing = {_slot(c) for c in remembering if c.signal in base.outputs}
     inside = {_slot(c) for c in remembering} - sensing
+    sensors = [name for name in base.outputs if any(c.signal == name for c in remembering)]
     names = (*base.inputs, *(disturbance(place) for place in places))
-    at_signal: dict[str, list[Candidate]] = {}
-    for candidate in attached:
-        if candidate.effect.kind not in ("input", "parameter", "constant"):
-            at_signal.setdefault(candidate.signal, []).append(candidate)
+    at_signal = effects_in_the_loop(attached)
 
     def own_of(candidate, parameters):
         return {p.name: parameters[candidate.parameter(p.name)] for p in candidate.effect.parameters}
@@ -118,16 +141,35 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             context |= {"duration": parameters[DURATION], "time": moment.time, "step_size": moment.step_size}
             if name in base.outputs:
                 context |= {input_named(key): held for key, held in moment.values.items()}
-            for candidate in at_signal.get(name, ()):
-                own = own_of(candidate, parameters)
-                if not candidate.effect.memory:
-                    value = candidate.effect.apply(own, value, context)
-                    continue
-                value, memory = candidate.effect.apply(own, value, context, moment.memories[_slot(candidate)])
-                moment.remember(_slot(candidate), memory)
+            effects = at_signal.get(name, ())
+            slots = {_slot(c): moment.memories[_slot(c)] for c in effects if c.effect.memory}
+
+            def behind_effects(value, memories):
+                following = dict(memories)
+                for candidate in effects:
+                    own = own_of(candidate, parameters)
+                    if candidate.effect.memory:
+                        slot = _slot(candidate)
+                        value, following[slot] = candidate.effect.apply(own, value, context, memories[slot])
+                    else:
+                        value = candidate.effect.apply(own, value, context)
+                return value, following
+
+            if effects:
+                value, following = where_on(parameters, [name], behind_effects, value, slots)
+                for slot, memory in following.items():
+                    moment.remember(slot, memory)
             return value
 
         return disturbed
+
+    def where_on(parameters, names, function, *operands):
+        """Return what the function makes of the operands, or these themselves where no effect acts at the signals."""
+        if not switched:
+            return function(*operands)
+        acting = functools.reduce(operator.or_, [parameters[switch(name)] > 0.0 for name in names])
+        typed = jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), operands, jax.eval_shape(function, *operands))
+        return lax.cond(acting, function, lambda *operands: operands, *typed)
 
     def corrected(parameters):
         changed = dict(parameters)
@@ -170,11 +212,17 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             once = base.stepper(now, step_size, disturbed) if steady is None else steady
             following = once(state.state, series)
             time = (state.steps + 1) * step_size
+            memories = current[0].memories
             if sensing:
                 ahead = series(1.0)
-                current[0] = _Moment(time, step_size, current[0].memories, sensing, added_by(ahead), ahead)
-                base.measure(now, following, ahead, disturbed)
-            return ExtendedState(following, state.steps + 1, time, current[0].memories)
+
+                def sensed(memories):
+                    current[0] = _Moment(time, step_size, memories, sensing, added_by(ahead), ahead)
+                    base.measure(now, following, ahead, disturbed)
+                    return (current[0].memories,)
+
+                (memories,) = where_on(parameters, sensors, sensed, memories)
+            return ExtendedState(following, state.steps + 1, time, memories)
 
         return step
 
