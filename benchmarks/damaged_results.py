@@ -141,9 +141,9 @@ def of_fits() -> Iterator[Call]:
     yield from damaged("Fit.save", fit.save, {"path": (folder / "again.npz", PATH | {"None": None})})
     yield from damaged("Fit.load", ehsvjax.Fit.load,
         {"path": (folder / "fit.npz", PATH | {"None": None}), "model": (model, THING)})  # fmt: skip
-    for wrong, argument in ((THING, "fit"), (THING, "record"), (without(THING, "None"), "validation"), (KEY, "key"),
+    for wrong, argument in ((THING, "fit"), (THING, "records"), (without(THING, "None"), "validation"), (KEY, "key"),
                             (THING, "bank"), (without(FLAG, "None"), "progress")):  # fmt: skip
-        right = {"fit": fit, "record": record, "validation": None, "key": jax.random.key(0), "bank": effects.BANK}
+        right = {"fit": fit, "records": record, "validation": None, "key": jax.random.key(0), "bank": effects.BANK}
         for label, value in wrong.items():
             yield Call(
                 "diagnose", argument, label, lambda a=argument, v=value, r=right: ehsvjax.diagnose(**{**r, a: v})
