@@ -18,6 +18,8 @@ Initial = str | Mapping[str, float] | Sequence[Mapping[str, float]]
 # in standard deviations of its noise.
 _FIRST = 5
 _REACH_OF_RANGE, _REACH_OF_NOISE = 0.1, 3.0
+# Share of an output's steps that are no steeper than its steepest but for spikes.
+_STEEPEST = 0.98
 
 
 def problem_of(
@@ -142,17 +144,20 @@ def _first_shown(parameter: Parameter, record: Record) -> _Shown | None:
     """Return where the output that shows an initial condition starts; None if it is not measured.
 
     From the least to the largest of the first readings, as a signal may turn at once and a reading may be a spike; by
-    their steepest step farther for every sample that is missing before them; and give or take a tenth of the output's
-    range and three times its noise.
+    the output's steepest step, but for spikes, farther for every sample that is missing before them, and for the first
+    one if it is a spike; and give or take a tenth of the output's range and three times its noise.
     """
     output = record.outputs.get(parameter.output) if parameter.output else None
     if output is None:
         return None
     present = np.flatnonzero(np.isfinite(output))
     first = output[present[:_FIRST]]
-    slopes = np.abs(np.diff(first) / np.diff(present[:_FIRST]))
+    # Where the first readings turn, those before them were steeper.
+    slopes = np.abs(np.diff(output[present]) / np.diff(present))
+    steepest = float(np.quantile(slopes, _STEEPEST)) if len(slopes) else 0.0
+    unknown = int(present[0]) + bool(np.max(slopes[:1], initial=0.0) > steepest)
     reach = _REACH_OF_RANGE * float(np.ptp(output[present])) + _REACH_OF_NOISE * guess_noise_variance(output) ** 0.5
-    return _Shown(float(np.min(first)), float(np.max(first)), reach + float(present[0] * np.max(slopes, initial=0.0)))
+    return _Shown(float(np.min(first)), float(np.max(first)), reach + unknown * steepest)
 
 
 def _wide_enough(parameter: Parameter, record: Record) -> Parameter:
