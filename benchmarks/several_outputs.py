@@ -153,10 +153,10 @@ def worth(trial: Trial, clean: dict[str, np.ndarray]) -> float:
         return np.concatenate([(getattr(motion, n) - clean[n])[steady[n]] / NOISE[n] for n in trial.outputs])
 
     def slopes(logarithms):
-        step = 1e-4 * np.eye(len(names))
-        changes = np.stack([left(logarithms + by) - left(logarithms - by) for by in step], axis=1)
+        step = 1e-4
+        changes = np.stack([left(logarithms + by) - left(logarithms - by) for by in step * np.eye(len(names))], axis=1)
         # Where a jump passes a reading there is no slope, and one would end the descent.
-        return np.where(np.abs(changes) < JUMP, changes, 0.0) / 2e-4
+        return np.where(np.abs(changes) < JUMP, changes, 0.0) / (2.0 * step)
 
     best = least_squares(left, np.zeros(len(names)), slopes, max_nfev=12, xtol=1e-6, ftol=1e-4)
     return float(2.0 * best.cost)

@@ -155,7 +155,7 @@ def _first_shown(parameter: Parameter, record: Record) -> _Shown | None:
     # Where the first readings turn, those before them were steeper.
     slopes = np.abs(np.diff(output[present]) / np.diff(present))
     steepest = float(np.quantile(slopes, _STEEPEST)) if len(slopes) else 0.0
-    unknown = int(present[0]) + bool(np.max(slopes[:1], initial=0.0) > steepest)
+    unknown = int(present[0]) + bool(np.any(slopes[:1] > steepest))
     reach = _REACH_OF_RANGE * float(np.ptp(output[present])) + _REACH_OF_NOISE * guess_noise_variance(output) ** 0.5
     return _Shown(float(np.min(first)), float(np.max(first)), reach + unknown * steepest)
 
