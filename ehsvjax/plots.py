@@ -214,7 +214,7 @@ def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
     measured, simulated, unit = record.outputs[name], fit.simulate(record)[name], fit.model.unit(name)
     command = fit.model.inputs[0]
     factor, label = _scaled(record.inputs[command], fit.model.unit(command))
-    style = "steps-post" if record.hold == "zero" else "default"
+    style = "steps-post" if record.hold_of(command) == "zero" else "default"
     command_axes.plot(record.time, record.inputs[command] / factor, color=_COMMAND, drawstyle=style)
     command_axes.set(ylabel=f"{_words(command)}\n{label}", title=_plain(record.name))
 

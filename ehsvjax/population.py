@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from ehsvjax import kernels
 from ehsvjax.models.model import Equations, Model, Parameter, identity
 from ehsvjax.record import Record
-from ehsvjax.simulate import Grid, constants_of, grid_of, input_array, scan_model
+from ehsvjax.simulate import Grid, constants_of, grid_of, input_array, scan_model, straight_inputs
 
 # Samples whose squares are added up plainly before the sum is added to the rest.
 _SUMMED_TOGETHER = 64
@@ -31,13 +31,15 @@ _SUMMED_TOGETHER = 64
 class Samples(NamedTuple):
     """Records side by side, padded at the end to the longest; `measured` is False where there is no sample.
 
-    `constants` are the parameters that are known in some record, by name; NaN in the others.
+    `straight` is 1 where an input runs straight to its next value, 0 where it is held. `constants` are the parameters
+    that are known in some record, by name; NaN in the others.
     """
 
     inputs: Float[Any, "record time input"]
     outputs: Float[Any, "record time signal"]
     measured: Bool[Any, "record time signal"]
     sample_period: Float[Any, " record"]
+    straight: Float[Any, "record input"]
     constants: dict[str, Float[Any, " record"]]
 
 
@@ -124,13 +126,9 @@ def stack_records(model: Model, records: Sequence[Record]) -> tuple[Samples, Gri
     The signals are those of `observed_outputs`; where a record does not hold one of them, nothing is measured.
 
     Raises:
-        ValueError: if the records differ in hold, lack an input, or hold outputs or constants that the model does not
-            have.
+        ValueError: if a record lacks an input, or holds outputs or constants that the model does not have.
 
     """
-    holds = sorted({record.hold for record in records})
-    if len(holds) > 1:
-        raise ValueError(f"expected records with one kind of hold, got {' and '.join(holds)}")
     longest = max(len(record) for record in records)
 
     def padded(array, fill):
@@ -148,12 +146,13 @@ def stack_records(model: Model, records: Sequence[Record]) -> tuple[Samples, Gri
         outputs=np.nan_to_num(stacked, nan=0.0),
         measured=np.isfinite(stacked),
         sample_period=np.array([record.sample_period for record in records]),
+        straight=np.array([straight_inputs(model, record) for record in records]),
         constants={
             name: np.array([c.get(name, np.nan) for c in constants]) for name in sorted(set().union(*constants))
         },
     )
-    substeps = max(grid_of(model, record).substeps for record in records)
-    return samples, Grid(substeps, holds[0])
+    grids = [grid_of(model, record) for record in records]
+    return samples, Grid(max(grid.substeps for grid in grids), any(grid.straight for grid in grids))
 
 
 def coordinates_of(parameters: Sequence[Parameter]) -> Coordinates:
@@ -345,6 +344,7 @@ def _scan(problem: Problem, parameters, own, samples: Samples, visit, carry, res
         carry,
         rest,
         scan,
+        samples.straight,
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,10 +23,14 @@ from ehsvjax.record_checks import (
     check_time,
     check_uniform,
     checked_constants,
+    checked_hold,
 )
 
 if TYPE_CHECKING:
     import pandas
+
+Hold = str | Mapping[str, str]
+"""What inputs do between samples, "zero" or "linear": one for all, or by name; those that are not named are held."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,7 +47,8 @@ class Record:
             `hold="linear"` it is interpolated.
         outputs: name -> values `[time]`, sample k taken at time[k]. NaN is a missing sample and carries no weight.
             May be empty, for a record that is only simulated.
-        hold: what the inputs do between samples, "zero" or "linear".
+        hold: what the inputs do between samples, "zero" or "linear". By name where they differ: {"reference": "linear",
+            "pulse": "zero"}; those that are not named are held.
         name: what the record is called in print and in legends.
         uniform: False admits non-uniform time, for a record that is then resampled: `sample_period` refuses it.
         constants: name of a model's parameter -> its value, SI, where it is known for this record and may be another in
@@ -54,15 +59,16 @@ class Record:
     time: Float[np.ndarray, " time"]
     inputs: Mapping[str, Float[np.ndarray, " time"]]
     outputs: Mapping[str, Float[np.ndarray, " time"]] = field(default_factory=dict)
-    hold: Literal["zero", "linear"] = "zero"
+    hold: Hold = "zero"
     name: str = "record"
     uniform: bool = True
     constants: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Check and copy the arguments."""
-        check_settings(self.hold, self.name, self.uniform)
+        check_settings(self.name, self.uniform)
         check_names(self.inputs, self.outputs)
+        hold = checked_hold(self.hold, self.inputs)
         time = vector("time", self.time)
         inputs = {name: vector(f"input {name!r}", values) for name, values in self.inputs.items()}
         outputs = {name: vector(f"output {name!r}", values) for name, values in self.outputs.items()}
@@ -75,6 +81,7 @@ class Record:
         object.__setattr__(self, "time", time)
         object.__setattr__(self, "inputs", MappingProxyType(inputs))
         object.__setattr__(self, "outputs", MappingProxyType(outputs))
+        object.__setattr__(self, "hold", hold)
         object.__setattr__(self, "constants", MappingProxyType(checked_constants(self.constants)))
 
     def __len__(self) -> int:
@@ -95,6 +102,10 @@ class Record:
         if not self.uniform:
             check_uniform(self.time)
         return self.duration / (len(self) - 1)
+
+    def hold_of(self, name: str) -> str:
+        """Say what one input does between samples, "zero" or "linear"."""
+        return self.hold.get(name, "zero") if isinstance(self.hold, Mapping) else self.hold
 
     def slice(self, start: float = -math.inf, stop: float = math.inf) -> "Record":
         """Take the samples with start <= time < stop, in s of the record's own time, which they keep.
@@ -158,11 +169,11 @@ class Record:
         stamps = np.linspace(0.0, self.duration, len(self)) if self.uniform else self.time - self.time[0]
         place = np.round(np.interp(grid, stamps, np.arange(len(self))), 6)  # in samples
         unknown = (place % 1 > 0) & np.append(gaps, False)[place.astype(int)]
-        hold = _hold_last if self.hold == "zero" else _interpolate
+        between = {"zero": _hold_last, "linear": _interpolate}
         return replace(
             self,
             time=self.time[0] + grid,
-            inputs={name: hold(values, place) for name, values in self.inputs.items()},
+            inputs={name: between[self.hold_of(name)](values, place) for name, values in self.inputs.items()},
             outputs={
                 name: np.where(unknown, np.nan, _interpolate(values, place)) for name, values in self.outputs.items()
             },
@@ -204,7 +215,7 @@ class Record:
         time: str | Column | float,
         inputs: Mapping[str, str | Column],
         outputs: Mapping[str, str | Column],
-        hold: Literal["zero", "linear"] = "zero",
+        hold: Hold = "zero",
         name: str = "record",
         uniform: bool = True,
     ) -> "Record":
@@ -226,7 +237,7 @@ class Record:
         time: str | Column | float,
         inputs: Mapping[str, str | Column],
         outputs: Mapping[str, str | Column],
-        hold: Literal["zero", "linear"] = "zero",
+        hold: Hold = "zero",
         name: str | None = None,
         uniform: bool = True,
         **read_csv: Any,
@@ -246,7 +257,7 @@ class Record:
         time: str | Column | float,
         inputs: Mapping[str, str | Column],
         outputs: Mapping[str, str | Column],
-        hold: Literal["zero", "linear"] = "zero",
+        hold: Hold = "zero",
         name: str | None = None,
         uniform: bool = True,
         **read_excel: Any,
@@ -266,7 +277,7 @@ class Record:
         time: str | Column | float,
         inputs: Mapping[str, str | Column],
         outputs: Mapping[str, str | Column],
-        hold: Literal["zero", "linear"] = "zero",
+        hold: Hold = "zero",
         name: str | None = None,
         uniform: bool = True,
     ) -> "Record":
@@ -285,7 +296,7 @@ class Record:
         time: str | Column | float,
         inputs: Mapping[str, str | Column],
         outputs: Mapping[str, str | Column],
-        hold: Literal["zero", "linear"] = "zero",
+        hold: Hold = "zero",
         name: str | None = None,
         uniform: bool = True,
     ) -> "Record":
@@ -304,7 +315,7 @@ class Record:
         time: str | Column | float,
         inputs: Mapping[str, str | Column],
         outputs: Mapping[str, str | Column],
-        hold: Literal["zero", "linear"] = "zero",
+        hold: Hold = "zero",
         name: str | None = None,
         uniform: bool = True,
     ) -> "Record":
@@ -319,10 +330,7 @@ class Record:
         """Give the name, the samples and the range of every signal."""
         steps = np.diff(self.time)
         period = f"{self.sample_period:.6g} s" if self.uniform else f"{steps.min():.6g} to {steps.max():.6g} s"
-        head = (
-            f"Record {self.name!r}: {len(self)} samples every {period}, {self._span()}, "
-            f"{'zero-order' if self.hold == 'zero' else 'linear'} hold"
-        )
+        head = f"Record {self.name!r}: {len(self)} samples every {period}, {self._span()}, {self._held()}"
         width = max(map(len, [*self.inputs, *self.outputs]), default=0)
         inputs = [f"  input   {name:{width}}  {_range(values)}" for name, values in self.inputs.items()]
         outputs = [f"  output  {name:{width}}  {_range(values)}" for name, values in self.outputs.items()]
@@ -332,7 +340,18 @@ class Record:
     def __reduce__(self) -> tuple:
         """Pickle and copy by the constructor's arguments: a read-only mapping cannot be pickled itself."""
         signals = (self.time, dict(self.inputs), dict(self.outputs))
-        return Record, (*signals, self.hold, self.name, self.uniform, dict(self.constants))
+        hold = dict(self.hold) if isinstance(self.hold, Mapping) else self.hold
+        return Record, (*signals, hold, self.name, self.uniform, dict(self.constants))
+
+    def _held(self) -> str:
+        """Say in words what the inputs do between samples."""
+        words = {"zero": "zero-order hold", "linear": "linear hold"}
+        by_hold: dict[str, list[str]] = {}
+        for name in self.inputs:
+            by_hold.setdefault(words[self.hold_of(name)], []).append(name)
+        if len(by_hold) < 2:
+            return next(iter(by_hold), words["zero"])
+        return ", ".join(f"{hold} of {' and '.join(names)}" for hold, names in by_hold.items())
 
     def _span(self) -> str:
         return f"{self.time[0]:.6g} to {self.time[-1]:.6g} s"

@@ -1,6 +1,7 @@
 """What makes samples on a time a record; refusals name the signal, the sample (counted from 0) and the remedy."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,31 @@ TOLERANCE = 0.02
 _LATEST = 1e12
 
 
-def check_settings(hold: Any, name: Any, uniform: Any) -> None:
-    """Raise ValueError for another hold, a name that is no text, or a `uniform` that is neither True nor False."""
-    choice("hold", hold, ("zero", "linear"))
+HOLDS = ("zero", "linear")
+"""What an input does between samples: it stays, or runs straight to the next value."""
+
+
+def checked_hold(hold: Any, inputs: Collection[str]) -> Any:
+    """Return what inputs do between samples, by name as a read-only mapping.
+
+    Raises:
+        ValueError: for another hold, or that of no input.
+
+    """
+    if not isinstance(hold, Mapping):
+        return choice("hold", hold, HOLDS)
+    for name, one in hold.items():
+        if name not in inputs:
+            raise ValueError(
+                f"expected the names of inputs in hold, {', '.join(inputs) or 'none'}; got {shown(name)}: mind the "
+                "spelling"
+            )
+        choice(f"the hold of {name}", one, HOLDS)
+    return MappingProxyType(dict(hold))
+
+
+def check_settings(name: Any, uniform: Any) -> None:
+    """Raise ValueError for a name that is no text, or a `uniform` that is neither True nor False."""
     instance("name", name, str, "write it between quotes")
     flag("uniform", uniform)
 

@@ -27,12 +27,12 @@ class Grid(NamedTuple):
 
     Attributes:
         substeps: integration steps per sample period.
-        hold: how the inputs run between samples, "zero" or "linear".
+        straight: whether any input runs straight from sample to sample.
 
     """
 
     substeps: int
-    hold: str
+    straight: bool
 
 
 def simulate(
@@ -80,6 +80,7 @@ def simulate(
             as_scalars(start),
             jnp.asarray(inputs),
             jnp.float64(record.sample_period),
+            jnp.asarray(straight_inputs(model, record)),
         )
     found = {name: np.asarray(outputs[name]) for name in model.outputs}
     if not all(np.isfinite(series[:2]).all() for series in found.values()):
@@ -124,7 +125,7 @@ def constants_of(model: Model, record: Record) -> dict[str, float]:
 
 
 def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
-    """Return the steps per sample that the model's `max_step` asks for, with the record's hold.
+    """Return the steps per sample that the model's `max_step` asks for, and whether inputs are straight.
 
     Raises:
         ValueError: for substeps that are not a positive whole number, or so many that a simulation would take minutes.
@@ -139,7 +140,7 @@ def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
             f"expected at most {_MOST_STEPS:g} integration steps, got {len(record)} samples of {substeps:.3g} each: "
             f"take fewer substeps, or a longer max_step of {model.name} ({model.max_step} s)"
         )
-    return Grid(int(substeps), record.hold)
+    return Grid(int(substeps), any(record.hold_of(name) == "linear" for name in record.inputs))
 
 
 def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]:
@@ -159,6 +160,14 @@ def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]
     return np.array([record.inputs[name] for name in model.inputs], float).reshape(len(model.inputs), len(record)).T
 
 
+def straight_inputs(model: Model, record: Record) -> Float[np.ndarray, " input"]:
+    """Return 1 for every input that runs straight from sample to sample, 0 for one that is held; in the model's order.
+
+    What the record does not hold is held.
+    """
+    return np.array([float(record.hold_of(name) == "linear") for name in model.inputs])
+
+
 def scan_model(
     equations: Equations,
     grid: Grid,
@@ -171,12 +180,13 @@ def scan_model(
     carry: Any,
     samples: Any,
     scan: Callable = lax.scan,
+    straight: Float[Array, " input"] | None = None,
 ):
     """Visit each sample of one trajectory: `visit(carry, outputs, sample) -> (carry, kept)`.
 
     Args:
         equations: the model's.
-        grid: steps per sample and hold.
+        grid: steps per sample, and whether any input is straight between them.
         signal: what every named signal passes through.
         parameters: scalars by name.
         initial: scalars by name.
@@ -186,6 +196,8 @@ def scan_model(
         carry: what `visit` accumulates.
         samples: pytree of arrays `[time, ...]`, of which `visit` sees a slice.
         scan: `lax.scan`, or what does the same.
+        straight: 1 for each input that runs straight from sample to sample, 0 for one that is held; None: all as the
+            grid says.
 
     Returns:
         the last carry, and what was kept, stacked `[time, ...]`.
@@ -193,14 +205,17 @@ def scan_model(
     """
     if equations.prepare is not None:
         inputs = equations.prepare(parameters, inputs, sample_period)
-    following = jnp.concatenate([inputs[1:], inputs[-1:]]) if grid.hold == "linear" else inputs
+    following = inputs
+    if grid.straight:
+        following = jnp.concatenate([inputs[1:], inputs[-1:]])
+        following = following if straight is None else jnp.where(straight > 0.0, following, inputs)
 
     def named(row):
         return dict(zip(equations.inputs, row, strict=True))
 
     def inputs_of(sample):
         now, then, _ = sample
-        if grid.hold == "zero":
+        if not grid.straight:
             return lambda fraction: named(now)
         return lambda fraction: named(now + fraction * (then - now))
 
@@ -222,9 +237,11 @@ def _is_count(leaf) -> bool:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _simulate(equations, grid, signal, parameters, initial, inputs, sample_period):
+def _simulate(equations, grid, signal, parameters, initial, inputs, sample_period, straight):
     def keep(carry, outputs, sample):
         return carry, outputs
 
-    _, outputs = scan_model(equations, grid, signal, parameters, initial, inputs, sample_period, keep, None, None)
+    _, outputs = scan_model(
+        equations, grid, signal, parameters, initial, inputs, sample_period, keep, None, None, straight=straight
+    )
     return outputs

@@ -156,11 +156,3 @@ def test_what_one_record_cannot_tell_another_supply_pressure_settles():
     assert alone.verdict == "ambiguous" and "constant_load" in alone.alternatives[0].causes, str(alone)
     assert (together.verdict, together.causes) == ("named", ("constant_load",)), str(together)
     assert together.extended.parameters["constant_load.force"] == pytest.approx(800.0, rel=0.1)
-
-
-@of_the_oscillator
-def test_records_of_unlike_hold_are_refused(bent):
-    records, found = bent
-    linear = ehsvjax.Record(records[0].time, records[0].inputs, records[0].outputs, hold="linear")
-    with pytest.raises(ValueError, match="expected records with one kind of hold"):
-        diagnose(found.fit, [records[0], linear], key=KEY)

@@ -62,7 +62,7 @@ def diagnose(
 
     Raises:
         ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short,
-            records of different hold, an effect of yours that fits no signal of the model, or one that is in the bank
+            an effect of yours that fits no signal of the model, or one that is in the bank
             twice.
 
     """
