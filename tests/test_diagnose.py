@@ -235,7 +235,7 @@ def test_what_is_printed_says_the_cause_and_its_numbers_are_attributes(diagnosis
         f"{100 * misfit.above_noise:.1f}%",
         f"{len(diagnosis.misfit.tests)} tests",
         f"bias {diagnosis.extended.parameters['sensor_bias.bias']:.4g}",
-        f"{diagnosis.table['likelihood_gain'].iloc[0]:.4g} times the",
+        f"{diagnosis.table['likelihood_gain'].iloc[0]:.4g} times what",
         f"rmse {gain.rmse_before:.4g} -> {gain.rmse_after:.4g}",
         f"noise {gain.noise_floor:.4g}",
         f"fit {gain.fit_before:.2f} -> {gain.fit_after:.2f}%",

@@ -10,10 +10,8 @@ from scipy.stats import chi2, norm
 from ehsvjax.diagnose.curves import _all_waves, knots_along, single_waves
 from ehsvjax.diagnose.dependence import _log_of_chi_square
 from ehsvjax.diagnose.gain import _gain
-from ehsvjax.diagnose.noise import lattice, noise_outside, plain_noise, spikes, whitening
-from ehsvjax.diagnose.refits import Refits
-from ehsvjax.diagnose.rivals import Rival, inseparable
-from ehsvjax.diagnose.significance import corrected, smallest_p_values
+from ehsvjax.diagnose.noise import Noise, lattice, noise_outside, plain_noise, spikes
+from ehsvjax.diagnose.significance import INSEPARABLE, corrected, smallest_p_values
 from ehsvjax.diagnose.suspects import _least_size
 from ehsvjax.precision.residual_noise import ResidualNoise
 
@@ -98,8 +96,7 @@ def test_whitened_noise_is_white_also_at_its_beginning():
     poles = np.array([1.0, -0.7])
     many = lfilter([1.0], poles, np.random.default_rng(3).standard_normal((4000, 220)), axis=1)[:, 200:]
     noise = ResidualNoise(0.0, np.array([0.7]), 1.0 / (1.0 - 0.49), 1.0)
-    white = whitening([[noise]], np.ones((1, 20, 1), bool))
-    found = white(many[:, None, :, None])
+    found = Noise(((noise,),), np.ones((1, 20, 1), bool)).innovations(many[:, None, :, None])
     assert found.shape == (4000, 20)
     np.testing.assert_allclose(np.cov(found.T), np.eye(20), atol=0.1)
 
@@ -108,7 +105,7 @@ def test_an_output_sampled_at_every_other_step_can_be_whitened():
     measured = np.zeros((1, 100, 1), bool)
     measured[0, ::2] = True
     noise = ResidualNoise(0.0, np.array([0.0, 0.9]), 1.0 / (1.0 - 0.81), 1.0)
-    assert whitening([[noise]], measured).used.sum() >= 48
+    assert Noise(((noise,),), measured).known.sum() >= 48
 
 
 def test_misfit_inside_the_span_is_not_taken_for_coloured_noise():
@@ -118,13 +115,25 @@ def test_misfit_inside_the_span_is_not_taken_for_coloured_noise():
     measured = np.ones(residual.shape, bool)
     found = noise_outside(residual, measured, series(misfit)[None])
     assert not found.coloured
-    assert found.noises[0][0].variance == pytest.approx(0.01, rel=0.15)
+    assert found.of[0][0].variance == pytest.approx(0.01, rel=0.15)
     assert noise_outside(residual, measured, series(np.ones(1500))[None]).coloured
 
 
 def test_plain_noise_weights_each_output_by_its_deviation():
-    white = plain_noise(np.array([4.0, 0.25]), np.ones((1, 3, 2), bool))
-    np.testing.assert_allclose(white(np.ones((1, 3, 2))), [0.5] * 3 + [2.0] * 3)
+    noise = plain_noise(np.array([4.0, 0.25]), np.ones((1, 3, 2), bool))
+    np.testing.assert_allclose(noise.scaled(np.ones((1, 3, 2))), [0.5] * 3 + [2.0] * 3)
+    np.testing.assert_allclose(noise.innovations(np.ones((1, 3, 2))), [0.5] * 3 + [2.0] * 3)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.7, -0.6])
+def test_noise_varies_along_a_direction_as_its_covariance_says(correlation):
+    rng = np.random.default_rng(5)
+    count = 120
+    noise = ResidualNoise(0.0, np.array([correlation]), 1.0 / (1.0 - correlation**2), 1.0)
+    lags = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+    some = rng.standard_normal((3, count))
+    expected = np.trace(some @ correlation**lags @ some.T) / np.sum(some**2)
+    assert Noise(((noise,),), np.ones((1, count, 1), bool)).along(some) == pytest.approx(expected, rel=1e-6)
 
 
 # --- Significance ---
@@ -205,39 +214,77 @@ def test_the_logarithm_of_a_p_value_goes_on_where_the_p_value_is_zero(freedom):
     assert _log_of_chi_square(far, freedom) == pytest.approx(chi2.logsf(near, freedom) + step, abs=0.2)
 
 
-# --- Rivals ---
+# --- What one explanation gains over another ---
+
+
+def left_and_more(amounts, direction, noise):
+    """Residuals without and with a term, refitted by least squares, of records that hold different amounts of it."""
+    left = noise + amounts[:, None] * direction
+    return left, left - (left @ direction / (direction @ direction))[:, None] * direction
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8, -0.5])
+@pytest.mark.parametrize("worth", [0.0, 30.0, 200.0])
+def test_a_gain_is_what_a_term_is_worth_whatever_the_correlation(correlation, worth):
+    rng = np.random.default_rng(6)
+    draws, count = 400, 600
+    shocks = rng.standard_normal((draws, count + 200))
+    noise = lfilter([1.0], [1.0, -correlation], shocks, axis=1)[:, 200:]
+    of = Noise(((ResidualNoise(0.0, np.array([correlation]), 1.0 / (1.0 - correlation**2), 1.0),),),
+               np.ones((1, count, 1), bool))  # fmt: skip
+    direction = np.sin(np.arange(count) / 7.0)
+    amount = np.sqrt(worth * of.along(direction) * of.variances[0, 0] / (direction @ direction))
+    left, more = left_and_more(np.full(draws, amount), direction, noise)
+    gains = np.array([of.gained(series(a), series(b)) for a, b in zip(left, more, strict=True)])
+    # A deviation that is estimated from twenty parts costs up to a sixth of it.
+    assert 0.8 * (worth + 1.0) < gains.mean() < 1.1 * (worth + 1.0)
+    assert gains.std() < 1.2 * np.sqrt(4.0 * worth + 2.0) + 0.1 * worth
 
 
 @pytest.mark.parametrize(
-    ("rival", "innocent", "gain", "kept"),
+    ("change", "innocent", "told"),
     [
-        ("another slow wave", False, 1e4, True),
-        ("another slow wave", True, 1e4, False),  # where noise alone is left, 3^2 tells
-        ("another slow wave", False, 1e2, False),  # it lacks too much of what the cause gains
-        ("worse throughout", False, 1e4, False),
-        ("worse at one place by more than is left", False, 1e6, False),
-        ("as good", True, 1e4, True),
+        ("another slow wave", False, False),  # beside a larger misfit it changes sides between parts
+        ("another slow wave", True, True),
+        ("worse throughout", False, True),
+        ("as good", True, False),
     ],
 )
-def test_what_is_left_decides_which_rivals_a_record_tells_from_the_best(rival, innocent, gain, kept):
+def test_what_is_left_decides_what_is_told_from_the_best(change, innocent, told):
     time = np.linspace(0.0, 1.0, 2000)
-    noise = np.random.default_rng(0).standard_normal(2000)
-    misfit = 0.0 if innocent else 0.8 * np.sin(9.0 * time)
-    change = {
-        "another slow wave": 0.3 * np.sin(31.0 * time + 1.0),
-        "worse throughout": 0.25 * np.random.default_rng(1).standard_normal(2000),
-        "worse at one place by more than is left": np.where(abs(time - 0.5) < 0.01, 9.0, 0.0),
-        "as good": 1e-3 * time,
-    }[rival]
+    best = np.random.default_rng(0).standard_normal(2000) + (0.0 if innocent else 0.8 * np.sin(9.0 * time))
+    other = (
+        best
+        + {
+            "another slow wave": 0.3 * np.sin(31.0 * time + 1.0),
+            "worse throughout": 0.25 * np.random.default_rng(1).standard_normal(2000),
+            "as good": 1e-3 * time,
+        }[change]
+    )
+    gained = plain_noise(np.ones(1), np.ones((1, 2000, 1), bool)).gained(series(other), series(best))
+    assert (gained > INSEPARABLE) == told
 
-    def refitted(residual):
-        nothing = np.zeros((1, 0))
-        return Refits(nothing, np.sum(residual**2, keepdims=True), series(residual)[None], nothing, nothing, nothing)
 
-    best = refitted(noise + misfit)
-    other = refitted(noise + misfit + change)
-    deficit = float(other.cost[0] - best.cost[0])
-    assert (deficit > 9.0) == (rival != "as good")
-    white = plain_noise(np.ones(1), np.ones((1, 2000, 1), bool))
-    group = (Rival(0, 0.0, best), Rival(1, deficit, other))
-    assert len(inseparable(group, gain, white, innocent)) == 1 + kept
+def test_a_term_of_one_record_gains_nothing_where_two_disagree_by_more():
+    """A drift explains what two records do, of unlike sign: neither amount of it is a gain."""
+    time = np.linspace(0.0, 1.0, 1000)
+    rng = np.random.default_rng(2)
+    both = rng.standard_normal((2, 1000)) + np.stack([3.0 * time, -2.5 * time])
+    direction = np.concatenate([time, time])
+    left, more = left_and_more(np.zeros(1), direction, both.reshape(1, -1))
+    noise = plain_noise(np.ones(1), np.ones((2, 1000, 1), bool))
+    left, more = (r.reshape(2, 1000, 1) for r in (left, more))
+    assert np.sum(left**2) - np.sum(more**2) > 20.0
+    assert noise.gained(left, more) < INSEPARABLE
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=30)
+def test_gains_are_of_opposite_sign_the_other_way_round_and_of_no_unit(seed):
+    rng = np.random.default_rng(seed)
+    left, more = rng.standard_normal((2, 2, 50, 1)) * rng.uniform(0.1, 3.0, 2)[:, None, None, None]
+    measured = rng.random((2, 50, 1)) < 0.9
+    noise, in_mm = (plain_noise(np.array([v]), measured) for v in (0.5, 0.5e6))
+    assert noise.gained(left, more) == pytest.approx(-noise.gained(more, left))
+    assert noise.gained(left, more) == pytest.approx(in_mm.gained(1e3 * left, 1e3 * more))
+    assert noise.gained(left, left) == 0.0

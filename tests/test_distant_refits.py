@@ -44,17 +44,17 @@ def starved():
 def led(starved):
     """Where a wrong supply pressure is led to from shares of its linear estimate."""
     bench = starved
-    white = plain_noise(np.array([1e-8]), bench.problem.samples.measured)
+    noise = plain_noise(np.array([1e-8]), bench.problem.samples.measured)
     trials = trials_of(bench, lambda stage, done: None)
-    current = refit_sets(trials, [[bench.nominal]], [()], white)
-    tried = responses_at(bench, current, (), white, trials.parts)
-    names = {bench.candidates[s.candidate].name: s for s in screen(bench, current, tried, white, 1).ranked}
+    current = refit_sets(trials, [[bench.nominal]], [()], noise)
+    tried = responses_at(bench, current, (), noise, trials.parts)
+    names = {bench.candidates[s.candidate].name: s for s in screen(bench, current, tried, noise, 1).ranked}
     screened = names["supply_pressure"]
     (column,) = bench.columns_of(bench.candidates[screened.candidate])
     starts = np.repeat(screened.start[None], len(SHARES), axis=0)
     starts[:, column] = np.clip(np.array(SHARES) * screened.start[column], *(b[column] for b in bounds_of(bench)))
     columns = padded([bench.columns_with((screened.candidate,))] * len(starts), most_unknowns(bench))
-    return current, refit(bench, starts, columns, white, race=False), column
+    return current, refit(bench, starts, columns, noise, race=False), column
 
 
 def test_every_start_leads_to_the_same_minimum(led):

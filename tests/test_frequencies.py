@@ -59,8 +59,8 @@ def test_parts_of_a_force_add_up_to_what_a_sine_does_to_the_plant(fit):
 def test_the_frequency_of_what_is_there_is_among_those_that_are_tried(fit, effect, sizes):
     noise = NOISE * np.random.default_rng(6).standard_normal(SAMPLES)
     bench = bench_of(fit, position(**{effect: sizes}) + noise)
-    white = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
-    current = refit(bench, bench.nominal[None], padded([bench.base_columns], len(bench.base_columns)), white)
-    tried = with_frequencies(bench, current, white, parts_of(bench)).scales[effect]["frequencies"]
+    noise = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
+    current = refit(bench, bench.nominal[None], padded([bench.base_columns], len(bench.base_columns)), noise)
+    tried = with_frequencies(bench, current, noise, parts_of(bench)).scales[effect]["frequencies"]
     resolution = 2.0 * np.pi / (SAMPLES * PERIOD)
     assert min(abs(frequency - sizes["frequency"]) for frequency in tried) < 0.5 * resolution

@@ -14,7 +14,7 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnose import Diagnosis, diagnose
 from tests.hidden_oracle import worth
-from tests.hidden_plants import effect_sizes
+from tests.hidden_plants import effect_sizes, held_levels, van_der_pol_with
 from tests.hidden_records import Hidden, records
 
 # A fresh seed each time; set the variable to repeat a run.
@@ -133,6 +133,33 @@ def test_what_makes_the_same_record_stays_one_group_beside_an_effect_that_turns_
     hidden = Hidden("van_der_pol", "white", 1e-2, ("input_gain", "asymmetric_damping"), 913980658)
     found, _, said = diagnosed(hidden)
     assert {"input_gain", "linear_stiffness", "asymmetric_damping"} <= held(found), said
+
+
+@of_the_oscillator
+def test_two_causes_that_chance_explains_about_as_well_are_told_with_it():
+    """A harmonic force and a drift, worth 41 more than a random force, of which their numbers' price leaves nothing."""
+    (made,) = records([Hidden("van_der_pol", "white", 0.01, ("harmonic_force", "parameter_drift"), 1455613565)])
+    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
+    fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=50, generations=20)
+    found = diagnose(fit, record, key=jax.random.key(0))
+    assert {"harmonic_force", "parameter_drift", "process_noise"} <= held(found), str(found)
+
+
+@of_the_oscillator
+def test_a_sensor_that_ends_just_below_the_peaks_is_named():
+    """Of an oscillator far from the paper's, that never reaches the limit where the search for it could begin."""
+    rng = np.random.default_rng(3)
+    command = held_levels(rng, 1.0, 60, 30)
+    position = van_der_pol_with([{}], command[None], 0.025, alpha=2.1, gamma=3.6)["position"][0]
+    limit = 0.95 * float(np.max(np.abs(position)))
+    measured = np.clip(position, -limit, limit) + 0.0016 * rng.standard_normal(len(position))
+    record = ehsvjax.Record(0.025 * np.arange(len(position)), {"command": command}, {"position": measured})
+    bounds = {"alpha": (1.0, 4.0), "gamma": (1.8, 7.0)}
+    fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=100, generations=20,
+                           bounds=bounds)  # fmt: skip
+    found = diagnose(fit, record, key=jax.random.key(0))
+    assert found.causes == ("sensor_saturation",), str(found)
+    assert found.extended.parameters["sensor_saturation.limit"] == pytest.approx(limit, rel=1e-3)
 
 
 @of_the_servovalve

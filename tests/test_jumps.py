@@ -59,12 +59,12 @@ def test_a_reading_within_the_error_of_a_jump_carries_no_weight(before, beside):
     record = ehsvjax.Record(time, {"pump": np.ones(SAMPLES)}, outputs)
     fit = ehsvjax.identify(_switch(), record, key=jax.random.key(0), population=20, generations=10)
     bench = workbench(fit, [record], BANK)
-    white = plain_noise(np.full(2, NOISE**2), bench.problem.samples.measured)
+    noise = plain_noise(np.full(2, NOISE**2), bench.problem.samples.measured)
     # Where the edge is, and not where chance has put the fit.
     point = bench.nominal.copy()
     point[bench.column["edge"]] = edge - 0.5
-    current = refit(bench, point[None], padded([bench.base_columns], len(bench.base_columns)), white, iterations=1)
-    left = without_jumps(bench, current, white).problem.samples.measured
+    current = refit(bench, point[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
+    left = without_jumps(bench, current, noise).problem.samples.measured
     dropped = bench.problem.samples.measured & ~left
     assert np.flatnonzero(dropped[0, :, 1]).tolist() == beside
     assert not dropped[0, :, 0].any()

@@ -140,22 +140,22 @@ def test_a_curve_that_always_acts_leaves_what_it_leaves_among_others(bench, plac
 
 
 def test_unknowns_beside_a_curve_make_up_for_what_they_can(bench):
-    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
     curve = straight_along(bench, "force", "position", quantities(bench), 9)
     # A stiffness that the plant has not: the unknowns lessen what it does, and cannot undo it.
     acting = bench_with(bench, curve, 20.0 * curve.knots)
     start, columns = bench.nominal[None], padded([bench.base_columns], len(bench.base_columns))
-    free, beside = (refit(b, start, columns, white, race=False) for b in (bench, acting))
-    at_once = white(acting.problem.samples.outputs - acting.simulated(start)[0])
+    free, beside = (refit(b, start, columns, noise, race=False) for b in (bench, acting))
+    at_once = noise.scaled(acting.problem.samples.outputs - acting.simulated(start)[0])
     assert free.cost[0] <= beside.cost[0] < float(at_once @ at_once)
 
 
 def test_a_set_that_cannot_be_simulated_does_not_get_the_refit_of_another():
     bench = bench_of(0.7)
     trials = trials_of(bench, lambda stage: None)
-    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
     lost = np.full_like(bench.nominal, np.nan)
-    found = refit_sets(trials, [[bench.nominal], [lost]], [(), (0,)], white)
+    found = refit_sets(trials, [[bench.nominal], [lost]], [(), (0,)], noise)
     assert np.isfinite(found.cost[0]) and found.cost[1] == np.inf
     assert set(trials.reached) == {frozenset()}
 
@@ -165,8 +165,8 @@ def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
     names = [c.name for c in bench.candidates]
     limit, rival = names.index("input_saturation"), names.index("input_gain")
     trials = trials_of(bench, lambda stage: None)
-    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
-    without = refit_sets(trials, [[bench.nominal]], [()], white)
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    without = refit_sets(trials, [[bench.nominal]], [()], noise)
     (column,) = bench.columns_of(bench.candidates[limit])
     unit = bench.problem.coordinates.upper[column]
     start = without.points[0].copy()
@@ -175,7 +175,7 @@ def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
         Screened(i, 5.0, 1e-6, 1e-4, p, np.zeros(SAMPLES), (), False, 0.0)
         for i, p in ((limit, start), (rival, without.points[0]))
     ]
-    found = refit_screened(trials, some, (), white, without)
+    found = refit_screened(trials, some, (), noise, without)
     assert found.points[0, column] * unit == pytest.approx(0.7, rel=0.02)
     assert found.cost[0] < 1.2 * SAMPLES < found.cost[1] < without.cost[0]
 
@@ -184,7 +184,7 @@ def test_a_single_cause_that_the_record_can_do_without_is_needless(bench):
     # What was found before readings beside a jump were left out may have been these readings.
     cause = [c.name for c in bench.candidates].index("input_saturation")
     trials = trials_of(bench, lambda stage: None)
-    white = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
-    nominal, found = (refit_sets(trials, [[bench.nominal]], [some], white) for some in ((), (cause,)))
-    weighed = _weighed(_look(trials, (cause,), found, white), nominal)
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    nominal, found = (refit_sets(trials, [[bench.nominal]], [some], noise) for some in ((), (cause,)))
+    weighed = _weighed(_look(trials, (cause,), found, noise), nominal)
     assert weighed.stage.included == (weighed.needless,), weighed.gains

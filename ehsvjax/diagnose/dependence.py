@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnose.curves import Curve, Terms, single_waves, waves_in
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
 
@@ -37,16 +37,16 @@ class Dependence(NamedTuple):
     period: float | None
 
 
-def dependences(final: Refits, white: Whitening, terms: Terms) -> tuple[Dependence, ...]:
+def dependences(final: Refits, noise: Noise, terms: Terms) -> tuple[Dependence, ...]:
     """Test whether a residual still depends on anything, the most significant first.
 
     Args:
         final: the refit whose residual is judged.
-        white: of its noise.
+        noise: of its noise.
         terms: that it could depend on, and what they do there or near.
 
     """
-    tests, r = _examined(final, white, terms)
+    tests, r = _examined(final, noise, terms)
     components = [(test.basis.T @ r)[None] for test in tests]
     p_values = [float(test.p_value(c)[0]) for test, c in zip(tests, components, strict=True)]
     null = smallest_p_values([test.basis for test in tests], [test.p_value for test in tests], seed=1)
@@ -58,12 +58,6 @@ def dependences(final: Refits, white: Whitening, terms: Terms) -> tuple[Dependen
         for test, p, c in zip(tests, p_values, components, strict=True)
     ]  # fmt: skip
     return tuple(sorted(found, key=lambda d: (d.p_value, -d.explained)))
-
-
-def strongest_dependence(current: Refits, white: Whitening, terms: Terms) -> float:
-    """Return the noise variances that a term of free form takes of a residual, more than noise would give."""
-    tests, r = _examined(current, white, terms)
-    return max((_explained(test.basis.T @ r) for test in tests), default=0.0)
 
 
 class _Test(NamedTuple):
@@ -119,10 +113,10 @@ def _log_of_chi_square(value: float, freedom: int) -> float:
     return float(np.log(p) if p > 0 else far)
 
 
-def _examined(final: Refits, white: Whitening, terms: Terms) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
+def _examined(final: Refits, noise: Noise, terms: Terms) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
     """Return the tests of curves that could show at all, and the whitened residual."""
-    known, r = unexplained(final, white)
-    changes = white(terms.responses)
+    known, r = unexplained(final, noise.innovations)
+    changes = noise.innovations(terms.responses)
     rows = np.split(changes, np.cumsum([len(c.pieces) for c in terms.curves])[:-1])
     tests = []
     for curve, part in zip(terms.curves, rows, strict=True):

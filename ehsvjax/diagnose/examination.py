@@ -7,8 +7,8 @@ import numpy as np
 
 from ehsvjax.diagnose.curves import Terms, terms_at
 from ehsvjax.diagnose.dependence import Dependence, dependences
-from ehsvjax.diagnose.missing import MissingTerm, likelihood, missing_term
-from ehsvjax.diagnose.noise import Whitening, noise_outside
+from ehsvjax.diagnose.missing import MissingTerm, missing_term
+from ehsvjax.diagnose.noise import Noise, noise_outside
 from ehsvjax.diagnose.process_noise import CONVINCING, ProcessNoise, process_noise
 from ehsvjax.diagnose.selection import SIGNIFICANT, Selection
 from ehsvjax.diagnose.significance import INSEPARABLE
@@ -26,9 +26,9 @@ class Examination(NamedTuple):
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
         chance: the random force that explains the nominal model's residual better than any cause; None if none does.
-        or_chance: whether a random force explains it about as well as the single cause.
-        instead: one term of free form that explains the record as well as several causes together, but for the price
-            of its pieces; None if none does.
+        or_chance: whether a random force explains it about as well as all causes together.
+        instead: one term of free form that explains the record as well as all causes together, but for the price of
+            its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
 
     """
@@ -46,19 +46,19 @@ class Examination(NamedTuple):
 def examine(selection: Selection) -> Examination:
     """Test what a selection leaves, and whether something else explains the record better."""
     bench = selection.bench
-    white, terms = selection.white, selection.trials.terms
-    before = dependences(selection.nominal, white, terms)
+    noise, terms = selection.noise, selection.trials.terms
+    before = dependences(selection.nominal, noise, terms)
     after = before
     if selection.included:
         terms = terms_at(bench, selection.final.points[0], selection.seen)
-        after = dependences(selection.final, white, terms)
+        after = dependences(selection.final, noise, terms)
     innocent = not _depends(selection, after, terms)
     chance, or_chance = _random_force(selection, before, innocent)
     if chance is not None:
         selection, after, innocent = selection.without_causes(), before, True
     if innocent:
-        selection = replace(selection, white=_own_noise(selection))
-    return Examination(selection, before, after, innocent, chance, or_chance, *_instead(selection, before))
+        selection = replace(selection, noise=_own_noise(selection))
+    return Examination(selection, before, after, innocent, chance, or_chance, *_instead(selection, before, innocent))
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
@@ -67,7 +67,7 @@ def remaining_term(examined: Examination) -> MissingTerm | None:
         return examined.instead
     selection = examined.selection
     return missing_term(
-        selection.bench, selection.final, selection.white, selection.seen, _suspects(examined.after)
+        selection.bench, selection.final, selection.noise, selection.seen, _suspects(examined.after)
     )  # fmt: skip
 
 
@@ -89,7 +89,7 @@ def _depends(selection: Selection, tests: tuple[Dependence, ...], terms: Terms) 
     return bool(again) and again[0].corrected < SIGNIFICANT
 
 
-def _own_noise(selection: Selection) -> Whitening:
+def _own_noise(selection: Selection) -> Noise:
     """Return the noise if all that is left is noise."""
     final = selection.final
     return noise_outside(final.residual[0], selection.bench.problem.samples.measured, final.slopes[0])
@@ -101,39 +101,45 @@ def _random_force(
     """Return the random force that explains the nominal model's residual better than any cause, if there is one.
 
     What the causes seemed to explain was then the motion that the force had left behind. And whether a random force
-    explains it about as well as a single cause.
+    explains it about as well as they do.
     """
     bench = selection.bench
-    nominal = process_noise(bench, selection.nominal, selection.white)
+    nominal = process_noise(bench, selection.nominal, selection.noise)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
         return None, False
     if selection.included:
-        final = process_noise(bench, selection.final, selection.white)
+        final = process_noise(bench, selection.final, selection.noise)
         # Where no force shows any more, the causes have made it invisible.
         better = -np.inf if final is None else nominal.likelihood - final.of_sensor + _least_price(selection)
         # A single cause that leaves nothing unexplained has the first word.
         single = innocent and len(selection.included) == 1
-        if not better > (CONVINCING if single else 0.0):
-            return None, bool(single and better > -INSEPARABLE)
+        if not better > (CONVINCING if single else INSEPARABLE):
+            return None, bool(better > -INSEPARABLE)
     if before and before[0].corrected < SIGNIFICANT:
         # A term that depends on what runs along the model is a better reason than chance.
-        term = missing_term(bench, selection.nominal, selection.white, selection.seen, _suspects(before))
-        if term.likelihood > nominal.likelihood:
+        term = missing_term(bench, selection.nominal, selection.noise, selection.seen, _suspects(before))
+        if _likelihood(selection.noise, term) > nominal.likelihood:
             return None, False
     return nominal, False
 
 
-def _instead(selection: Selection, before: tuple[Dependence, ...]) -> tuple[MissingTerm | None, bool]:
-    """Return a term of free form that explains the record as well as several causes together, and whether better."""
-    if len(selection.included) < 2 or not before:
+def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
+    """Return a term of free form that explains the record as well as all causes together, and whether better."""
+    causes = selection.included
+    if not before or not causes or (innocent and len(causes) == 1):
         return None, False
-    white = selection.white
-    term = missing_term(selection.bench, selection.nominal, white, selection.seen, _suspects(before))
-    r = white(selection.final.residual[0])
-    price = float(np.log(len(r)))
-    causes = likelihood(float(r @ r), len(r), white) - price * sum(_numbers(selection, i) for i in selection.included)
-    as_well = term.likelihood + term.pieces * price > causes - INSEPARABLE
-    return (term if as_well else None), term.likelihood > causes
+    noise = selection.noise
+    term = missing_term(selection.bench, selection.nominal, noise, selection.seen, _suspects(before))
+    price = float(np.log(noise.measured.sum()))
+    better = noise.gained(selection.final.residual[0], term.residual)
+    better += price * sum(_numbers(selection, i) for i in causes)
+    return (term if better > -INSEPARABLE else None), better > price * term.pieces
+
+
+def _likelihood(noise: Noise, term: MissingTerm) -> float:
+    """Return twice the logarithm of the likelihood of what a term leaves, less Bayes' price for its pieces."""
+    r = noise.innovations(term.residual)
+    return -noise.log_units - float(len(r) * (np.log(r @ r / len(r)) + 1.0) + term.pieces * np.log(len(r)))
 
 
 def _least_price(selection: Selection) -> float:

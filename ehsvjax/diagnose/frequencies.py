@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.parts import Parts, parts_at
 from ehsvjax.diagnose.refits import Refits, unexplained
 from ehsvjax.diagnose.workbench import Workbench, duration_of
@@ -32,10 +32,10 @@ def parts_of(bench: Workbench) -> dict[str, Parts]:
     return {place: parts_at(bench, bench.nominal, place) for place in places}
 
 
-def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts: Mapping[str, Parts]) -> Workbench:
+def with_frequencies(bench: Workbench, current: Refits, noise: Noise, parts: Mapping[str, Parts]) -> Workbench:
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
     duration = duration_of(bench.records)
-    known, r = unexplained(current, white)
+    known, r = unexplained(current, noise.innovations)
     scales: dict[str, Scales] = {}
     for candidate in bench.candidates:
         if not candidate.effect.harmonic:
@@ -48,7 +48,7 @@ def with_frequencies(bench: Workbench, current: Refits, white: Whitening, parts:
             there = parts[candidate.signal]
             edge = min(highest, 2.0 * np.pi * _PERIODS_PER_PART / there.length)
             frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration)
-            peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, white, known, r, there))
+            peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, noise, known, r, there))
             lowest = edge
         # A record that does not hold the first output says nothing of it.
         for k in np.flatnonzero(bench.problem.samples.measured[..., 0].any(axis=1)).tolist():
@@ -63,10 +63,10 @@ def _by_parts(bench: Workbench, candidate: Candidate) -> bool:
 
 
 def _explained(
-    bench: Workbench, candidate: Candidate, frequencies, white: Whitening, known, r, parts: Parts
+    bench: Workbench, candidate: Candidate, frequencies, noise: Noise, known, r, parts: Parts
 ) -> Float[np.ndarray, " frequency"]:
     """Return the noise variances of the residual that an effect would take at each frequency, to first order."""
-    changes = white(parts.responses)
+    changes = noise.innovations(parts.responses)
     changes = changes - (changes @ known) @ known.T
     shares = _shares(bench, candidate, frequencies, parts)
     along = shares @ (changes @ r)

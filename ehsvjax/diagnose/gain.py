@@ -4,16 +4,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
-from ehsvjax.diagnose.noise import Whitening
-from ehsvjax.diagnose.refits import Refits, padded, refit
+from ehsvjax.diagnose.prediction import HELD_BACK, Predicted, predicted
 from ehsvjax.diagnose.selection import Selection
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
 
-# Of a record that is held back where there is no other.
-_HELD_BACK = 0.3
 _BLOCKS = 20
 _DRAWS = 2000
 
@@ -78,11 +75,13 @@ def gain_of(
     if validation:
         judged = [_validated(selection, nominal, extended, record) for record in validation]
         on = f"{', '.join(names)}, which {'was' if len(names) == 1 else 'were'} not used"
-    elif len(records) > 1:
-        judged = [_left_out(selection, k) for k in range(len(records))]
-        on = "each record, predicted from the others"
     else:
-        judged, on = [_held_back(selection)], f"the last {_HELD_BACK:.0%} of the record, which was held back"
+        starts = np.stack([selection.nominal.points[0], selection.final.points[0]])
+        unused = predicted(selection.bench, [(), selection.included], starts, selection.noise)
+        judged = [_of_record(selection, unused, k) for k in range(len(records))]
+        on = "each record, predicted from the others"
+        if len(records) == 1:
+            on = f"the last {HELD_BACK:.0%} of the record, which was held back"
     return Gain(_gains([_together(judged)], rng)[0], tuple(_gains(judged, rng)), names, on)
 
 
@@ -116,59 +115,23 @@ def _validated(selection: Selection, nominal: Fit, extended: Fit, record: Record
     judged = record.select(outputs=names)
     before, after = (fit.residuals(judged) for fit in (nominal, extended))
     # The noise of a record of which nothing is known: the mean of those that are.
-    variances = {n: selection.white.variance_of(bench.problem.observed.index(n)) for n in names}
+    variances = {n: selection.noise.variance_of(bench.problem.observed.index(n)) for n in names}
     return _Judged(
         {n: before[n] for n in names}, {n: after[n] for n in names}, {n: record.outputs[n] for n in names}, variances
     )
 
 
-def _held_back(selection: Selection) -> _Judged:
-    """Return the last part of a single record; both models are refitted to the first alone."""
-    measured = selection.bench.problem.samples.measured
-    counted = np.cumsum(measured[0].sum(axis=-1))
-    cut = int(np.searchsorted(counted, (1.0 - _HELD_BACK) * counted[-1]))
-    used = selection.white.used.copy()
-    used[:, cut:] = False
-    return _judged(selection, _both_refitted(selection, used).residual, 0, slice(cut, None))
-
-
-def _left_out(selection: Selection, record: int) -> _Judged:
-    """Return one of several records; both models are refitted to the others, and start in it as it says itself."""
-    bench = selection.bench
-    used = selection.white.used.copy()
-    used[record] = False
-    others = _both_refitted(selection, used)
-    points, names = others.points.copy(), bench.problem.names
-    of_record = [j for j, name in enumerate(names) if name.endswith(f"[{record}]")]
-    initial = [j for j in of_record if j in bench.base_columns]
-    # What is of a run no other record tells.
-    points[:, of_record] = np.where(np.isin(of_record, initial), points[:, of_record], bench.nominal[of_record])
-    own = selection.white._replace(used=selection.white.used & ~used)
-    width = max(len(initial), 1)
-    started = refit(bench, points, padded([initial] * len(points), width), own, race=False)
-    return _judged(selection, started.residual, record, slice(None))
-
-
-def _both_refitted(selection: Selection, used: Bool[np.ndarray, "record time signal"]) -> Refits:
-    """Return the refits of the nominal and of the extended model to some of the readings."""
-    bench = selection.bench
-    white = Whitening(selection.white.noises, used)
-    sets = [bench.columns_with(()), bench.columns_with(selection.included)]
-    starts = np.stack([selection.nominal.points[0], selection.final.points[0]])
-    return refit(bench, starts, padded(sets, selection.final.chosen.shape[1]), white, race=False)
-
-
-def _judged(selection: Selection, residual, record: int, part: slice) -> _Judged:
-    """Return a part of a record, from the residuals `[model, record, time, signal]` of both models."""
-    bench, noises = selection.bench, selection.white.noises[record]
-    samples = bench.problem.samples
-    kept = np.where(samples.measured[record], 1.0, np.nan)[part]
-    before, after = (residual[k, record, part] * kept for k in (0, 1))
-    readings = samples.outputs[record, part] * kept
-    there = [(i, n) for i, n in enumerate(bench.problem.observed) if n in bench.records[record].outputs]
+def _of_record(selection: Selection, unused: Predicted, record: int) -> _Judged:
+    """Return one record, or the part of it that was not used."""
+    bench, noises = selection.bench, selection.noise.of[record]
+    there = unused.noise.measured[record].any(axis=-1)
+    kept = np.where(unused.noise.measured[record], 1.0, np.nan)[there]
+    before, after = (residual[record, there] * kept for residual in unused.residual)
+    readings = bench.problem.samples.outputs[record, there] * kept
+    named = [(i, n) for i, n in enumerate(bench.problem.observed) if n in bench.records[record].outputs]
     return _Judged(
-        {n: before[:, i] for i, n in there}, {n: after[:, i] for i, n in there}, {n: readings[:, i] for i, n in there},
-        {n: noises[i].variance for i, n in there},
+        {n: before[:, i] for i, n in named}, {n: after[:, i] for i, n in named}, {n: readings[:, i] for i, n in named},
+        {n: noises[i].variance for i, n in named},
     )  # fmt: skip
 
 

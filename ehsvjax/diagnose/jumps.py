@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from ehsvjax.arithmetic import LEFT_OUT, few
-from ehsvjax.diagnose.noise import Whitening, standing_out
+from ehsvjax.diagnose.noise import Noise, standing_out
 from ehsvjax.diagnose.refits import Refits, bounds_of
 from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 
@@ -20,18 +20,18 @@ from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 _ERRORS, _STRAIGHT = 3.0, 0.3
 
 
-def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbench:
+def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
     """Return the bench without readings that jump within the errors of a refit; itself if there is none.
 
     Args:
         bench: the trials' workbench.
         current: one refit.
-        white: of its noise.
+        noise: of its noise.
 
     """
     samples = bench.problem.samples
     point, columns = current.points[0], current.chosen[0][current.chosen[0] >= 0]
-    jacobian = white(current.slopes[0][: len(columns)])
+    jacobian = noise.scaled(current.slopes[0][: len(columns)])
     norms = np.linalg.norm(jacobian, axis=1)
     seen = norms > 0
     if not seen.any():
@@ -46,7 +46,8 @@ def without_jumps(bench: Workbench, current: Refits, white: Whitening) -> Workbe
     points[1:, moved] = np.clip(point[moved] + np.concatenate([errors.T, -errors.T]), lower[moved], upper[moved])
     outputs = bench.simulated(points)
     forward, backward = np.split(outputs[1:], 2)
-    bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0) / np.sqrt(white.variances)[:, None, :]
+    deviations = np.sqrt(noise.innovation_variances)[:, None]
+    bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0) / deviations
     # More than the others: the first reading of a bend that begins bends less.
     alone = [standing_out(bent[..., i], _STRAIGHT) for i in range(bent.shape[-1])]
     jumping = samples.measured & np.stack(alone, axis=-1)

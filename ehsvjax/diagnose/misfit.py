@@ -111,7 +111,7 @@ def _of_record(
             continue
         measured = samples.measured[record, present, i]
         residual = np.where(measured, selection.nominal.residual[0, record, present, i], np.nan)
-        noise = selection.white.noises[record][i]
+        noise = selection.noise.of[record][i]
         found = residual_noise(
             np.nan_to_num(residual)[None] / np.nanstd(residual), measured[None], "white"
         )  # fmt: skip

@@ -23,7 +23,7 @@ from ehsvjax.diagnose.curves import (
     wave_along,
 )
 from ehsvjax.diagnose.dependence import Dependence
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.refits import Refits, bounds_of, refit, span, unexplained
 from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.smoothing import Smooth, of_one_wave, smoothed
@@ -62,7 +62,7 @@ class MissingTerm(NamedTuple):
         period: in the quantity's unit, if the term is a single wave along it; else None.
         explained: share of the residual's sum of squares above the noise that it takes.
         pieces: effective number of them, for smooth as it is; a single wave counts as three.
-        likelihood: twice its logarithm with this term, less Bayes' price for its pieces; for one output.
+        residual: `[record, time, signal]` what the records are with it, less what is simulated.
         alike: other places and quantities, by whose curves the record is explained as well, `(place, quantity)`.
 
     """
@@ -79,14 +79,14 @@ class MissingTerm(NamedTuple):
     period: float | None
     explained: float
     pieces: float
-    likelihood: float
+    residual: Float[np.ndarray, "record time signal"]
     alike: tuple[tuple[str, str], ...]
 
 
 def missing_term(
     bench: Workbench,
     final: Refits,
-    white: Whitening,
+    noise: Noise,
     seen: Mapping[str, Float[np.ndarray, "record time"]],
     suspects: Sequence[Dependence],
 ) -> MissingTerm:
@@ -97,7 +97,7 @@ def missing_term(
     on the opening alone is a change of the opening): among those that explain alike, the one at whose place the
     quantity is at home.
     """
-    known, r = unexplained(final, white)
+    known, r = unexplained(final, noise.scaled)
     knots = len(r) // _SAMPLES_PER_KNOT
 
     def drawn(suspect):
@@ -105,13 +105,13 @@ def missing_term(
             curve = wave_along(bench, suspect.place, suspect.quantity, seen, suspect.period)
         else:
             curve = straight_along(bench, suspect.place, suspect.quantity, seen, suspect.pieces)
-        return _drawn(bench, final, white, curve, final.points[0], np.zeros(len(curve.pieces)))
+        return _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.pieces)))
 
     def drawn_finely(coarse):
         start = coarse.settled
         fine = straight_along(bench, *start.curve[:2], seen, max(len(start.coefficients), knots))
         begun = np.interp(fine.knots, start.curve.knots, start.coefficients @ start.curve.values)
-        return min(coarse, _drawn(bench, final, white, fine, start.point, begun), key=_cost)
+        return min(coarse, _drawn(bench, final, noise, fine, start.point, begun), key=_cost)
 
     every = sorted((drawn(s) for s in suspects), key=_cost)
     different: dict[tuple[str, str], _Drawn] = {}
@@ -124,7 +124,7 @@ def missing_term(
     # Whatever moves is a function of time: that is the last of all reasons.
     best = min(alike, key=lambda d: (not _at_home(d), d.settled.curve.quantity == TIME, d.cost))
     others = dict.fromkeys(d.settled.curve[:2] for d in (*alike, *_alike(every)))
-    curve, smooth, left = best.settled.curve, best.smooth, best.left
+    curve, smooth = best.settled.curve, best.smooth
     place, quantity = curve[:2]
     probe = probe_at(bench, place)
     free = best.settled.free
@@ -132,7 +132,7 @@ def missing_term(
     coefficients = smooth.coefficients + _least(term, lines) @ free
     variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
-    taken = float(r @ r) - left - smooth.pieces
+    taken = float(r @ r) - best.left - smooth.pieces
     return MissingTerm(
         place=place,
         unit="" if curve.relative else bench.fit.model.unit(place),
@@ -146,14 +146,9 @@ def missing_term(
         period=float(curve.periods[0]) if len(curve.periods) else None,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
         pieces=smooth.pieces,
-        likelihood=likelihood(left, len(r), white) - smooth.pieces * float(np.log(len(r))),
+        residual=best.residual,
         alike=tuple(other for other in others if other != (place, quantity)),
     )
-
-
-def likelihood(left: float, count: int, white: Whitening) -> float:
-    """Return twice the logarithm of the likelihood of whitened residuals with this sum of squares, at its best."""
-    return -white.log_units - float(count * np.log(left / count)) - count
 
 
 def _least(term, free) -> Float[np.ndarray, " line"]:
@@ -176,8 +171,8 @@ class _Settled(NamedTuple):
         curve: its pieces.
         point: `[parameter]` of the unknowns beside it.
         coefficients: in probes.
-        left: the sum of squares of the whitened residual that it leaves.
-        readings: whitened: that residual with what the curve explains, outside of what the refitted unknowns can do.
+        left: the sum of squares of the scaled residual that it leaves.
+        readings: that residual with what the curve explains, outside of what the refitted unknowns can do.
         responses: of each piece, the same.
         free: straight lines that the unknowns make up for: any amount of them explains the record as well.
 
@@ -197,26 +192,33 @@ class _Drawn(NamedTuple):
 
     settled: _Settled
     smooth: Smooth
+    residual: Float[np.ndarray, "record time signal"]
     left: float
     cost: float
 
 
-def _drawn(bench: Workbench, final: Refits, white: Whitening, curve: Curve, point, coefficients) -> _Drawn:
-    settled = _settled(bench, final, white, curve, point, coefficients)
+def _drawn(bench: Workbench, final: Refits, noise: Noise, curve: Curve, point, coefficients) -> _Drawn:
+    settled = _settled(bench, final, noise, curve, point, coefficients)
     responses, readings = settled.responses, settled.readings
-    smooth = of_one_wave(responses, readings) if len(curve.periods) else smoothed(curve.knots, responses, readings)
+    if len(curve.periods):
+        smooth = of_one_wave(responses, readings)
+    else:
+        smooth = smoothed(curve.knots, responses, readings, noise.along(responses))
     # What the unknowns took beside the curve stays taken.
     beside = settled.left - float(np.sum((readings - settled.coefficients @ responses) ** 2))
     without = beside + float(readings @ readings)
     # What the record hardly tells may have gone so far that the smooth curve is another one once it is simulated.
-    left = _left_beside(bench_with(bench, curve, smooth.coefficients), final, white, settled.point)
-    return _Drawn(settled, smooth, left, without - smooth.evidence + max(left - beside - smooth.left, 0.0))
+    beside_it = _refitted_beside(bench_with(bench, curve, smooth.coefficients), final, noise, settled.point)
+    left = float(beside_it.cost[0])
+    cost = without - smooth.evidence + max(left - beside - smooth.left, 0.0)
+    return _Drawn(settled, smooth, beside_it.residual[0], left, cost)
 
 
-def _left_beside(acting: Workbench, final: Refits, white: Whitening, point) -> float:
-    """Return the sum of squares that the unknowns leave beside a curve that acts, refitted from two points."""
+def _refitted_beside(acting: Workbench, final: Refits, noise: Noise, point) -> Refits:
+    """Return the refit of the unknowns beside a curve that acts, the better of those from two points."""
     starts = np.stack([point, final.points[0]])
-    return float(np.min(refit(acting, starts, np.repeat(final.chosen, 2, axis=0), white, race=False).cost))
+    both = refit(acting, starts, np.repeat(final.chosen, 2, axis=0), noise, race=False)
+    return both.of([int(np.argmin(both.cost))])
 
 
 def _cost(drawn: _Drawn) -> float:
@@ -239,15 +241,15 @@ def _alike(some: Sequence[_Drawn]) -> list[_Drawn]:
     return [d for d in some if d.cost <= best.cost + max(INSEPARABLE, lacking)]
 
 
-def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, point, coefficients) -> _Settled:
+def _settled(bench: Workbench, final: Refits, noise: Noise, curve: Curve, point, coefficients) -> _Settled:
     """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each."""
     measured = bench.problem.samples.outputs
     columns = final.chosen[0][final.chosen[0] >= 0]
     lower, upper = bounds_of(bench)
-    r = white(measured - outputs_with(bench, point[None], coefficients[None], curve)[0])
+    r = noise.scaled(measured - outputs_with(bench, point[None], coefficients[None], curve)[0])
     left = float(np.nan_to_num(r @ r, nan=np.inf))
     for _ in range(_STEPS):
-        rows = white(slopes_with(bench, point, columns, coefficients, curve))
+        rows = noise.scaled(slopes_with(bench, point, columns, coefficients, curve))
         unknowns, pieces = rows[: len(columns)], rows[len(columns) :]
         points, curves = [], []
         # In coordinates of what they span, as there are many more samples than pieces.
@@ -257,7 +259,7 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, po
             moved[columns] = np.clip(point[columns] + of_unknowns, lower[columns], upper[columns])
             points.append(moved)
             curves.append(coefficients + of_pieces)
-        residuals = white(measured - outputs_with(bench, np.stack(points), np.stack(curves), curve))
+        residuals = noise.scaled(measured - outputs_with(bench, np.stack(points), np.stack(curves), curve))
         costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
         # The most damped of those as good: what the record hardly tells is not to wander.
         best = int(np.flatnonzero(costs <= np.min(costs) + _SETTLED)[-1])
@@ -273,7 +275,7 @@ def _settled(bench: Workbench, final: Refits, white: Whitening, curve: Curve, po
 
 
 def _damped_steps(unknowns, pieces, r) -> list[tuple[Float[np.ndarray, " unknown"], Float[np.ndarray, " piece"]]]:
-    """Return Levenberg-Marquardt steps of several dampings each, from whitened responses.
+    """Return Levenberg-Marquardt steps of several dampings each, from scaled responses.
 
     What the unknowns can do is theirs, and a curve stays where it is in whatever the record does not show beside them:
     a change that both can make would be shared, and the curve wander.

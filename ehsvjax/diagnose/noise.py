@@ -5,11 +5,10 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from ehsvjax.precision.residual_noise import (
     ResidualNoise,
@@ -20,56 +19,146 @@ from ehsvjax.precision.residual_noise import (
 
 # Directions of the candidates' responses below this share of the largest are counted as noise.
 _NEGLIGIBLE = 1e-3
+# Of a record, between which an explanation's gain may differ.
+_PARTS = 20
 # A sample stands alone if it differs from its neighbours by this many deviations of a difference.
 _SPIKE = 4.0
 
 
-class Whitening(NamedTuple):
-    """Makes noise white and of variance one: the innovations of an autoregression of each output in each record.
+class Noise(NamedTuple):
+    """What a model leaves if it is right: of each output in each record, white or an autoregression.
+
+    Refits are by least squares, which no noise deceives; what differs between two of them counts in the variance of
+    what is left along that difference. Only tests of whether noise alone is left ask for innovations.
 
     Attributes:
-        noises: `[record][signal]` of each output, in its unit.
-        used: `[record, time, signal]` samples whose innovation can be computed.
+        of: `[record][signal]` the noise of each output, in its unit.
+        measured: `[record, time, signal]` readings that count.
 
     """
 
-    noises: tuple[tuple[ResidualNoise, ...], ...]
-    used: Bool[np.ndarray, "record time signal"]
+    of: tuple[tuple[ResidualNoise, ...], ...]
+    measured: Bool[np.ndarray, "record time signal"]
 
-    def __call__(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
-        """Return the whitened samples that can be used."""
+    def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return the readings that count in deviations of the noise, one output after the other."""
+        return np.moveaxis(series / np.sqrt(self.variances)[:, None], -1, -3)[..., self._in_turn]
+
+    def innovations(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return what is new in each reading, in its deviations: white and of variance one, if the series is noise.
+
+        A reading needs those before it.
+        """
         from scipy.signal import lfilter  # slow to import
 
-        parts = []
-        for i, k in np.ndindex(self.used.shape[-1], self.used.shape[0]):
-            noise, whitened = self.noises[k][i], series[..., k, :, i]
+        parts, known = [], self.known
+        for i, k in np.ndindex(self.measured.shape[-1], self.measured.shape[0]):
+            noise, whitened = self.of[k][i], series[..., k, :, i]
             order = len(noise.coefficients)
             if order:
                 first = whitened[..., :order] @ _first_innovations(noise).T
                 whitened = lfilter(np.concatenate([[1.0], -noise.coefficients]), 1.0, whitened, axis=-1)
                 whitened[..., :order] = first
-            parts.append(whitened[..., self.used[k, :, i]] / np.sqrt(noise.innovation_variance))
+            parts.append(whitened[..., known[k, :, i]] / np.sqrt(noise.innovation_variance))
         return np.concatenate(parts, axis=-1)
+
+    def gained(
+        self,
+        left: Float[np.ndarray, "record time signal"],
+        more: Float[np.ndarray, "record time signal"],
+        doubt: Float[np.ndarray, "direction sample"] | None = None,
+    ) -> float:
+        """Return by how much one explanation's residual is less than another's, in variances of what is left.
+
+        The difference of their sums of squares, over the variance of the better one's residual along what the two do
+        differently: that of the noise, or, if it is more, as it differs from part to part of the records. Where noise
+        alone is left, this is twice the logarithm of the likelihood ratio. Where more is left, whatever is flexible
+        gains by it, and what it gains in one part it loses in another (Wald's test with the covariance of White 1982,
+        "Maximum likelihood estimation of misspecified models", and for rivals Vuong 1989, "Likelihood ratio tests for
+        model selection and non-nested hypotheses", with parts for samples, as what is left is correlated).
+
+        Args:
+            left: measured minus simulated, by the one; in the outputs' units. What is not finite is infinitely worse.
+            more: by the other.
+            doubt: of predictions, what they do not know themselves: scaled, by one deviation of what was estimated.
+
+        """
+        both = self.scaled(left), self.scaled(more)
+        squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in both]
+        if not all(map(np.isfinite, squares)):
+            return 0.0 if squares[0] == squares[1] else squares[0] - squares[1]
+        best, change = both[int(np.argmin(squares))], both[0] - both[1]
+        square = float(change @ change)
+        if not square > 0.0:
+            return 0.0
+        between_parts = float(np.sum(np.bincount(self._part_of, change * best) ** 2)) / square
+        of_noise = self.along(change)
+        if doubt is not None:
+            of_noise += float(np.sum((doubt @ change) ** 2)) / square
+        return (squares[0] - squares[1]) / max(of_noise, between_parts)
+
+    def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
+        """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""
+        if not self.coloured:
+            return 1.0
+        flat = directions.reshape(-1, directions.shape[-1])
+        series = np.zeros((*self._in_turn.shape, len(flat)))
+        series[self._in_turn] = flat.T
+        through = sum(
+            float(np.trace(meat(series[i, k][None], noise))) / noise.variance
+            for k, of_record in enumerate(self.of) for i, noise in enumerate(of_record)
+        )  # fmt: skip
+        return through / float(np.sum(flat**2))
+
+    @property
+    def known(self) -> Bool[np.ndarray, "record time signal"]:
+        """Readings whose innovation can be computed: those before them are measured too."""
+        known = self.measured.copy()
+        for k, i in np.ndindex(*_channels(known)):
+            coefficients = self.of[k][i].coefficients
+            order = len(coefficients)
+            for lag in range(1, order + 1):
+                if coefficients[lag - 1] != 0.0:
+                    known[k, lag:, i] &= self.measured[k, :-lag, i]
+            # The first samples are made white together.
+            known[k, :order, i] &= self.measured[k, :order, i].all()
+        return known
 
     @property
     def variances(self) -> Float[np.ndarray, "record signal"]:
+        """Of each output's noise, in its unit squared."""
+        return np.array([[noise.variance for noise in of_record] for of_record in self.of])
+
+    @property
+    def innovation_variances(self) -> Float[np.ndarray, "record signal"]:
         """Of the innovations of each output, in its unit squared: of what a sample tells alone."""
-        return np.array([[noise.innovation_variance for noise in of_record] for of_record in self.noises])
+        return np.array([[noise.innovation_variance for noise in of_record] for of_record in self.of])
 
     def variance_of(self, signal: int) -> float:
         """Return the variance of one output's noise, the mean over the records."""
-        counts = self.used[..., signal].sum(axis=1)
-        return float(np.average([noises[signal].variance for noises in self.noises], weights=np.maximum(counts, 1e-9)))
+        counts = self.measured[..., signal].sum(axis=1)
+        return float(np.average(self.variances[:, signal], weights=np.maximum(counts, 1e-9)))
 
     @property
     def log_units(self) -> float:
-        """Sum of the logarithms of these variances over the samples: what likelihoods of whitened ones leave out."""
-        return float(np.sum(self.used.sum(axis=1) * np.log(self.variances)))
+        """Sum of the logarithms of the innovations' variances: what likelihoods of innovations leave out."""
+        return float(np.sum(self.known.sum(axis=1) * np.log(self.innovation_variances)))
 
     @property
     def coloured(self) -> bool:
         """Whether any output's noise is correlated."""
-        return any(len(noise.coefficients) for of_record in self.noises for noise in of_record)
+        return any(len(noise.coefficients) for of_record in self.of for noise in of_record)
+
+    @property
+    def _in_turn(self) -> Bool[np.ndarray, "signal record time"]:
+        return np.moveaxis(self.measured, -1, 0)
+
+    @property
+    def _part_of(self) -> Int[np.ndarray, " sample"]:
+        """The part of its record in which each scaled reading lies, counted on from record to record."""
+        counted = np.cumsum(self.measured.any(axis=-1), axis=1)
+        within = np.maximum(counted - 1, 0) * _PARTS // np.maximum(counted[:, -1:], 1)
+        return np.broadcast_to(within + _PARTS * np.arange(len(within))[:, None], self._in_turn.shape)[self._in_turn]
 
 
 def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample"]:
@@ -81,25 +170,11 @@ def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample
     return np.sqrt(noise.innovation_variance) * np.linalg.inv(root)
 
 
-def whitening(noises: Sequence[Sequence[ResidualNoise]], measured: Bool[np.ndarray, "record time signal"]) -> Whitening:
-    """Return the whitening of noises for what is measured: a sample needs those before it."""
-    used = measured.copy()
-    for k, i in np.ndindex(*_channels(measured)):
-        coefficients = noises[k][i].coefficients
-        order = len(coefficients)
-        for lag in range(1, order + 1):
-            if coefficients[lag - 1] != 0.0:
-                used[k, lag:, i] &= measured[k, :-lag, i]
-        # The first samples are made white together.
-        used[k, :order, i] &= measured[k, :order, i].all()
-    return Whitening(tuple(map(tuple, noises)), used)
-
-
 def plain_noise(
     variances: Float[np.ndarray, "*record signal"], measured: Bool[np.ndarray, "record time signal"]
-) -> Whitening:
+) -> Noise:
     """Return white noise of these variances, in the outputs' units squared: least squares as `identify` does them."""
-    return whitening([[_white(v) for v in row] for row in np.broadcast_to(variances, _channels(measured))], measured)
+    return Noise(tuple(tuple(map(_white, row)) for row in np.broadcast_to(variances, _channels(measured))), measured)
 
 
 def _white(variance: float) -> ResidualNoise:
@@ -115,7 +190,7 @@ def noise_outside(
     residual: Float[np.ndarray, "record time signal"],
     measured: Bool[np.ndarray, "record time signal"],
     responses: Float[np.ndarray, "response record time signal"],
-) -> Whitening:
+) -> Noise:
     """Return the noise that is left of a residual outside the space of some responses.
 
     Args:
@@ -159,7 +234,7 @@ def noise_outside(
             variance=noise.variance * square, innovation_variance=noise.innovation_variance * square
         )  # fmt: skip
 
-    return whitening([[in_units(k, i) for i in range(signals)] for k in range(records)], measured)
+    return Noise(tuple(tuple(in_units(k, i) for i in range(signals)) for k in range(records)), measured)
 
 
 def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:

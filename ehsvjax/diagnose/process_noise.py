@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.parts import parts_at
 from ehsvjax.diagnose.refits import Refits, span
 from ehsvjax.diagnose.workbench import Workbench
@@ -33,19 +33,19 @@ class ProcessNoise(NamedTuple):
     of_sensor: float
 
 
-def process_noise(bench: Workbench, final: Refits, white: Whitening) -> ProcessNoise | None:
+def process_noise(bench: Workbench, final: Refits, noise: Noise) -> ProcessNoise | None:
     """Compare a random force with noise of the sensor; None for several outputs, or where no force shows.
 
-    By the samples that are used for any other explanation too, as `white` says: likelihoods of others are no
+    By the samples that are used for any other explanation too, as `noise` says: likelihoods of others are no
     comparison.
     """
     kinds = {s.name: s.kind for s in bench.fit.model.signals}
     places = [p for p in bench.places if kinds[p] == "force"]
     if not places or len(bench.problem.observed) > 1:
         return None
-    measured = white.used[..., 0]
+    measured = noise.known[..., 0]
     # Each record in deviations of its own noise.
-    deviation = np.sqrt(white.variances)
+    deviation = np.sqrt(noise.innovation_variances)
     known = span((final.slopes[0][..., 0] / deviation)[:, measured])
     residual = final.residual[0][..., 0] / deviation
     r = residual[measured]
@@ -60,7 +60,7 @@ def process_noise(bench: Workbench, final: Refits, white: Whitening) -> ProcessN
         _likelihood_of_sensor(np.where(there, one, 0.0)[None], there[None])
         for one, there in zip(residual, measured, strict=True)
     )
-    units = white.log_units
+    units = noise.log_units
     return ProcessNoise(places[0], intensity * parts.length, 2.0 * force - units, 2.0 * sensor - units)
 
 

@@ -1,12 +1,12 @@
-"""Refits: from many starts at once, each with unknowns of its own, by Levenberg-Marquardt on whitened residuals."""
+"""Refits: from many starts at once, each with unknowns of its own, by Levenberg-Marquardt on scaled residuals."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
@@ -24,7 +24,7 @@ class Refits(NamedTuple):
 
     Attributes:
         points: `[individual, parameter]` the best point of each.
-        cost: the sum of squares of its whitened residuals.
+        cost: the sum of squares of its scaled residuals.
         residual: measured minus simulated there, in the outputs' units.
         slopes: derivatives of the outputs by the chosen unknowns there; zero along padding.
         chosen: `[individual, direction]` the unknowns' columns; -1 is padding.
@@ -55,11 +55,17 @@ def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sa
 
 
 def unexplained(
-    final: Refits, white: Whitening
+    final: Refits, weigh: Callable[[np.ndarray], np.ndarray]
 ) -> tuple[Float[np.ndarray, "sample independent"], Float[np.ndarray, " sample"]]:
-    """Return what the unknowns of a refit can do to first order, and its residual outside of that, both whitened."""
-    known = span(white(final.slopes[0]))
-    residual = white(final.residual[0])
+    """Return what the unknowns of a refit can do to first order, and its residual outside of that, both weighed.
+
+    Args:
+        final: one refit.
+        weigh: `Noise.scaled`, or `Noise.innovations`.
+
+    """
+    known = span(weigh(final.slopes[0]))
+    residual = weigh(final.residual[0])
     return known, residual - known @ (known.T @ residual)
 
 
@@ -85,7 +91,7 @@ def refit(
     bench: Workbench,
     starts: Float[np.ndarray, "individual parameter"],
     chosen: Int[np.ndarray, "individual direction"],
-    white: Whitening,
+    noise: Noise,
     iterations: int = _ITERATIONS,
     race: bool = True,
 ) -> Refits:
@@ -99,7 +105,7 @@ def refit(
         bench: the trials' workbench.
         starts: points.
         chosen: columns of the unknowns of each start; -1 is padding.
-        white: of the noise.
+        noise: of the noise.
         iterations: at most this many steps.
         race: whether the starts compete: what is far behind the best is given up.
 
@@ -123,17 +129,15 @@ def refit(
             break
         y, slopes = bench.linearised(trial[at], chosen[at])
         residual = readings[None] - y
-        whitened = white(residual)
-        columns = white(slopes)
+        scaled = noise.scaled(residual)
+        columns = noise.scaled(slopes)
         for row, i in enumerate(at):
-            value = float(whitened[row] @ whitened[row])
+            value = float(scaled[row] @ scaled[row])
             jacobian = columns[:, row]
             # A NaN is no improvement, nor is a place that is so steep that nothing can be told from there.
             if value < cost[i] and np.max(np.abs(jacobian), initial=0.0) < _STEEPEST:
                 points[i], cost[i] = trial[i], value
-                kept[i] = _Here(
-                    residual[row], slopes[:, row], jacobian, jacobian @ whitened[row], jacobian @ jacobian.T
-                )
+                kept[i] = _Here(residual[row], slopes[:, row], jacobian, jacobian @ scaled[row], jacobian @ jacobian.T)
                 damping[i], growth[i] = 0.1 * damping[i], 2.0
             else:
                 damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
@@ -142,13 +146,13 @@ def refit(
                 running[i] = False
                 continue
             step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
-            if gain < 0.01 * max(cost[i] / whitened.shape[1], 1e-300):
+            if gain < 0.01 * max(cost[i] / scaled.shape[1], 1e-300):
                 converged[i] = True
                 running[i] = False
             elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
                 running[i] = False
             trial[i] = points[i] + step
-        _bend(bench, white, trial, np.flatnonzero(running), points, chosen, kept, damping, lower, upper)
+        _bend(bench, noise, trial, np.flatnonzero(running), points, chosen, kept, damping, lower, upper)
     shape = bench.problem.samples.outputs.shape
     nothing = (np.full(shape, np.nan), np.zeros((width, *shape)))
     return Refits(
@@ -162,7 +166,7 @@ def refit(
 
 
 class _Here(NamedTuple):
-    """What is known at the best point of a start; from the jacobian on whitened."""
+    """What is known at the best point of a start; from the jacobian on scaled."""
 
     residual: Float[np.ndarray, "record time signal"]
     slopes: Float[np.ndarray, "direction record time signal"]
@@ -171,7 +175,7 @@ class _Here(NamedTuple):
     information: Float[np.ndarray, "direction direction"]
 
 
-def _bend(bench, white, trial, running, points, chosen, kept, damping, lower, upper) -> None:
+def _bend(bench, noise, trial, running, points, chosen, kept, damping, lower, upper) -> None:
     """Add to steps half the acceleration that keeps them in their valley, where it is less than the step itself."""
     if not len(running):
         return
@@ -181,7 +185,7 @@ def _bend(bench, white, trial, running, points, chosen, kept, damping, lower, up
         here, own = kept[i], np.maximum(chosen[i], 0)
         assert here is not None
         along = np.where(chosen[i] >= 0, steps[row][own], 0.0)
-        changed = white(ahead[row] - (bench.problem.samples.outputs - here.residual))
+        changed = noise.scaled(ahead[row] - (bench.problem.samples.outputs - here.residual))
         curvature = 2.0 / _AHEAD * (changed / _AHEAD - along @ here.jacobian)
         if not np.isfinite(curvature).all():
             continue

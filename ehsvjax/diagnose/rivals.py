@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.refits import Refits, padded, refit
 from ehsvjax.diagnose.screening import Screened, responses_at, screen
 from ehsvjax.diagnose.significance import INSEPARABLE
@@ -20,9 +20,6 @@ _SWAPS = 3
 _LOWER = 0.1
 # Deficit to first order of a rival that is refitted, however many there are; a large effect is not of first order.
 _WORTH_A_REFIT = 100.0
-# Where a misfit is left: share of a cause's gain that a rival may lack, parts of the record that are compared, and
-# deviations between them.
-_LACKS, _PARTS, _SURELY = 0.1, 20, 3.0
 
 
 def price(bench: Workbench, candidate: int, point: Float[np.ndarray, " parameter"]) -> float:
@@ -36,52 +33,27 @@ def price(bench: Workbench, candidate: int, point: Float[np.ndarray, " parameter
 
 
 class Rival(NamedTuple):
-    """A refit of one candidate in the place of another: how much worse than the best, in noise variances."""
+    """A refit of one candidate in the place of another: how much worse than the best, as `Noise.gained` counts."""
 
     candidate: int
     deficit: float
     refitted: Refits
 
 
-def inseparable(group: Sequence[Rival], gain: float, white: Whitening, innocent: bool) -> tuple[Rival, ...]:
-    """Return those rivals that a record cannot tell from the best: within `INSEPARABLE` if noise alone is left.
-
-    A misfit that none of them explains counts for one or the other by chance. What nearly gains as much as the best is
-    then only excluded by more than all that is left, or by more than what differs by chance between parts of the record
-    (Vuong 1989, "Likelihood ratio tests for model selection and non-nested hypotheses", with parts for samples, as what
-    is left is correlated).
-
-    Args:
-        group: all that was refitted in the place of one effect, the best first.
-        gain: of the best, in noise variances.
-        white: the noise of what is left.
-        innocent: whether that is noise alone.
-
-    """
-    best = white(group[0].refitted.residual[0]) ** 2
-    left = 0.0 if innocent else float(best.sum()) - len(best)
-
-    def excluded(rival: Rival) -> bool:
-        if rival.deficit < INSEPARABLE:
-            return False
-        if rival.deficit > min(left, _LACKS * gain):
-            return True
-        worse = white(rival.refitted.residual[0]) ** 2 - best
-        parts = [part.sum() for part in np.array_split(worse, _PARTS)]
-        return rival.deficit > _SURELY * float(np.sqrt(_PARTS) * np.std(parts, ddof=1))
-
-    return tuple(rival for rival in group if not excluded(rival))
+def inseparable(group: Sequence[Rival]) -> tuple[Rival, ...]:
+    """Return those of an effect's rivals that a record cannot tell from the best."""
+    return tuple(rival for rival in group if rival.deficit < INSEPARABLE)
 
 
 def rivals_of_all(
-    trials: Trials, included: tuple[int, ...], final: Refits, white: Whitening
+    trials: Trials, included: tuple[int, ...], final: Refits, noise: Noise
 ) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
     """Return the effects after swaps for better rivals, their refit, and for each all that could be there instead."""
     groups: dict[int, tuple[Rival, ...]] = {}
     swaps, waiting = 0, list(included)
     while waiting:
         own = waiting.pop(0)
-        group = _rivals_of(trials, own, tuple(j for j in included if j != own), final, white)
+        group = _rivals_of(trials, own, tuple(j for j in included if j != own), final, noise)
         best = group[0]
         if swaps < _SWAPS and (best.candidate != own or _cost(best.refitted) < _cost(final) - _LOWER):
             # The others are looked at anew, beside what is better.
@@ -94,7 +66,7 @@ def rivals_of_all(
 
 
 def rivals_again(
-    trials: Trials, included: tuple[int, ...], final: Refits, groups: Sequence[Sequence[Rival]], white: Whitening
+    trials: Trials, included: tuple[int, ...], final: Refits, groups: Sequence[Sequence[Rival]], noise: Noise
 ) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
     """Return the same as `rivals_of_all` from where all have been refitted, under another step or noise."""
     ranked = []
@@ -103,9 +75,9 @@ def rivals_again(
         # Beside what has been swapped in for another cause, some have too many numbers.
         able = [r for r in group if r.candidate != own and fits(trials.bench, (*rest, r.candidate))]
         starts, others = [[r.refitted.points[0]] for r in able], [r.candidate for r in able]
-        led = refit_sets(trials, starts, [(*rest, i) for i in others], white, race=True) if others else None
+        led = refit_sets(trials, starts, [(*rest, i) for i in others], noise, race=True) if others else None
         found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
-        ranked.append(_ranked(trials, own, {own: final} | found))
+        ranked.append(_ranked(trials, own, {own: final} | found, noise))
     for own, group in zip(included, ranked, strict=True):
         if group[0].candidate != own:
             included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
@@ -113,37 +85,42 @@ def rivals_again(
     return included, final, tuple(ranked)
 
 
-def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, white: Whitening) -> tuple[Rival, ...]:
+def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, noise: Noise) -> tuple[Rival, ...]:
     """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
     start = without(bench, final.points[0], own)
-    current = refit_set(trials, start, rest, white)
-    base = _beside(trials, start, current, white) if rest else current
+    current = refit_set(trials, start, rest, noise)
+    base = _beside(trials, start, current, noise) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
-    found = _refitted_from(trials, base, own, rest, white, start)
-    return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)})
+    found = _refitted_from(trials, base, own, rest, noise, start)
+    return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
 
 
-def _ranked(trials: Trials, own: int, found: Mapping[int, Refits]) -> tuple[Rival, ...]:
+def _ranked(trials: Trials, own: int, found: Mapping[int, Refits], noise: Noise) -> tuple[Rival, ...]:
     """Return what was refitted in the place of an effect, the best first, with how much worse each is."""
-    rivals = [
-        Rival(candidate, _cost(refitted) + price(trials.bench, candidate, refitted.points[0]), refitted)
-        for candidate, refitted in found.items()
-        if np.isfinite(_cost(refitted))
-    ]
-    rivals.sort(key=lambda rival: rival.deficit)
-    least = rivals[0].deficit
-    if rivals[0].candidate != own and least > next(r.deficit for r in rivals if r.candidate == own) - 1e-3:
-        # As good but for rounding: no reason to swap.
-        rivals.sort(key=lambda rival: rival.candidate != own)
-    return tuple(r._replace(deficit=max(0.0, r.deficit - least)) for r in rivals)
+    able = {candidate: refitted for candidate, refitted in found.items() if np.isfinite(_cost(refitted))}
+    prices = {candidate: price(trials.bench, candidate, refitted.points[0]) for candidate, refitted in able.items()}
+
+    def behind(best: int) -> dict[int, float]:
+        """Return by how much each is worse than one of them, their prices included."""
+        return {
+            candidate: noise.gained(refitted.residual[0], able[best].residual[0]) + prices[candidate] - prices[best]
+            for candidate, refitted in able.items()
+        }
+
+    lowest = behind(min(able, key=lambda candidate: _cost(able[candidate])))
+    best = min(lowest, key=lambda candidate: lowest[candidate])
+    # As good but for rounding: no reason to swap.
+    best = own if lowest[own] < lowest[best] + 1e-3 else best
+    ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))
+    return tuple(Rival(candidate, max(0.0, deficit), able[candidate]) for candidate, deficit in ranked)
 
 
 def _cost(refitted: Refits) -> float:
     return float(refitted.cost[0])
 
 
-def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Refits, white: Whitening) -> Refits:
+def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Refits, noise: Noise) -> Refits:
     """Return the point where the model's own unknowns are refitted, and other effects stay as they are with the cause.
 
     Once these have gone to make up for what is not there, they do not always find back: a frequency for one.
@@ -153,21 +130,23 @@ def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Ref
     # The model's unknowns from where they are with the cause, and from where they are without it.
     starts = np.stack([start, start])
     starts[1, own] = current.points[0, own]
-    held = refit(bench, starts, padded([own] * 2, current.chosen.shape[1]), white)
-    return refit(bench, held.points[np.argmin(held.cost)][None], current.chosen, white, iterations=1)
+    held = refit(bench, starts, padded([own] * 2, current.chosen.shape[1]), noise)
+    return refit(bench, held.points[np.argmin(held.cost)][None], current.chosen, noise, iterations=1)
 
 
 def _refitted_from(
-    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], white: Whitening, with_it: np.ndarray
+    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], noise: Noise, with_it: np.ndarray
 ) -> dict[int, Refits]:
     """Return the refits of candidates that are, at a point without the effect, most like it.
 
     Also from where all else is as it is with it.
     """
     bench = trials.bench
-    screening = screen(bench, base, responses_at(bench, base, rest, white, trials.parts), white, 1)
+    screening = screen(bench, base, responses_at(bench, base, rest, noise, trials.parts), noise, 1)
     close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
-    refitted = refit_screened(trials, close, rest, white, base, [with_it])
+    if not close:
+        return {}
+    refitted = refit_screened(trials, close, rest, noise, base, [with_it])
     return {s.candidate: refitted.of([k]) for k, s in enumerate(close)}
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnose.frequencies import with_frequencies
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.parts import Parts
 from ehsvjax.diagnose.refits import Refits, bounds_of, unexplained
 from ehsvjax.diagnose.significance import corrected, smallest_p_values
@@ -99,7 +99,7 @@ class Responses(NamedTuple):
 
 
 def responses_at(
-    bench: Workbench, current: Refits, excluded: Collection[int], white: Whitening, parts: Mapping[str, Parts]
+    bench: Workbench, current: Refits, excluded: Collection[int], noise: Noise, parts: Mapping[str, Parts]
 ) -> Responses:
     """Simulate the trials of every candidate but the excluded ones from the point of a refit.
 
@@ -107,11 +107,11 @@ def responses_at(
         bench: the trials' workbench.
         current: one refit.
         excluded: positions of candidates that it includes already.
-        white: of the noise in which frequencies are looked for.
+        noise: of the noise in which frequencies are looked for.
         parts: the responses to parts of a disturbance, by signal, for the same.
 
     """
-    bench = with_frequencies(bench, current, white, parts)
+    bench = with_frequencies(bench, current, noise, parts)
     point = current.points[0]
     trials = [
         trial for i, c in enumerate(bench.candidates) if i not in excluded for trial in _trials(bench, i, c, point)
@@ -155,21 +155,21 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
     return found
 
 
-def screen(bench: Workbench, current: Refits, tried: Responses, white: Whitening, harmonics: int) -> Screening:
+def screen(bench: Workbench, current: Refits, tried: Responses, noise: Noise, harmonics: int) -> Screening:
     """Score every trial under a noise.
 
     Args:
         bench: the trials' workbench.
         current: the refit to which an effect would be added.
         tried: the responses at its point.
-        white: of the noise.
+        noise: of the noise.
         harmonics: how many frequencies were searched for the few that were tried.
 
     """
     from scipy.special import ndtri
 
-    known, r = unexplained(current, white)
-    g = white(tried.changes)
+    known, r = unexplained(current, noise.innovations)
+    g = noise.innovations(tried.changes)
     whole = np.linalg.norm(g, axis=1)
     g = g - (g @ known) @ known.T
     left = np.linalg.norm(g, axis=1)

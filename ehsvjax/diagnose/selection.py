@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
-from ehsvjax.diagnose.dependence import strongest_dependence
 from ehsvjax.diagnose.jumps import without_jumps
-from ehsvjax.diagnose.noise import Whitening, noise_outside, plain_noise
+from ehsvjax.diagnose.noise import Noise, noise_outside, plain_noise
+from ehsvjax.diagnose.prediction import predicted
 from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, price, rivals_again, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
+from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -22,7 +23,6 @@ from ehsvjax.diagnose.trials import (
     refit_reshaped,
     refit_screened,
     refit_set,
-    refit_sets,
     trials_of,
     without,
 )
@@ -35,10 +35,6 @@ _MOST_EFFECTS = 3
 _ROUNDS = 6
 # Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
 _WEIGHED = 25.0
-# A term of free form that explains so much more than the best candidate shows that the bank lacks something.
-_BANK_LACKS_IT = 3.0
-# Of what is left above the noise, what the next effect must take.
-_SHARE_OF_MISFIT = 0.15
 
 
 class Stage(NamedTuple):
@@ -50,7 +46,7 @@ class Stage(NamedTuple):
     trials: Trials
     included: tuple[int, ...]
     current: Refits
-    white: Whitening
+    noise: Noise
     screening: Screening
 
 
@@ -79,10 +75,10 @@ class Selection:
         included: positions of the effects, in the order in which they were found.
         final: the refit with them.
         nominal: the refit without any, under the same noise.
-        white: the noise of what is left.
+        noise: the noise of what is left.
         stages: the looks, the first at the nominal model.
         rivals: for each included effect all that were refitted in its place, the best, itself, first.
-        gains: for each included effect how much worse the fit is without it, in noise variances.
+        gains: for each included effect how much worse the fit is without it, as `Noise.gained` counts.
         integration: how all was simulated.
 
     """
@@ -91,7 +87,7 @@ class Selection:
     included: tuple[int, ...]
     final: Refits
     nominal: Refits
-    white: Whitening
+    noise: Noise
     stages: tuple[Stage, ...]
     rivals: tuple[tuple[Rival, ...], ...]
     gains: tuple[float, ...]
@@ -139,15 +135,15 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         last = weighed.stage
         start = without(last.trials.bench, last.current.points[0], weighed.needless)
         rest = tuple(j for j in last.included if j != weighed.needless)
-        refitted = refit_set(last.trials, start, rest, last.white)
-        weighed = _weighed(_look(last.trials, rest, refitted, last.white), nominal)
+        refitted = refit_set(last.trials, start, rest, last.noise)
+        weighed = _weighed(_look(last.trials, rest, refitted, last.noise), nominal)
     last = weighed.stage
     return Selection(
         trials=last.trials,
         included=last.included,
         final=last.current,
         nominal=weighed.nominal,
-        white=last.white,
+        noise=last.noise,
         stages=(*stages, last),
         rivals=weighed.rivals,
         gains=weighed.gains,
@@ -162,7 +158,7 @@ class _Weighed(NamedTuple):
         stage: with the causes after swaps for better rivals, at the step that all that is compared needs.
         nominal: the refit without any, under the same noise.
         rivals: for each cause all that was refitted in its place, the best first.
-        gains: for each cause how much worse the fit is without it, in noise variances.
+        gains: for each cause how much worse the fit is without it, as `Noise.gained` counts.
         needless: the cause that is needed least, if the record can do without it.
         worth: noise variances by which halving the step changes the difference of any two of them.
 
@@ -179,32 +175,32 @@ class _Weighed(NamedTuple):
 def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
     looked_at = set(stage.included)
-    included, final, rivals = rivals_of_all(stage.trials, stage.included, stage.current, stage.white)
+    included, final, rivals = rivals_of_all(stage.trials, stage.included, stage.current, stage.noise)
     for rounds_left in reversed(range(_ROUNDS)):
         stage = stage._replace(included=included, current=final)
-        trials, white = stage.trials, stage.white
-        nominal = refit_set(trials, nominal.points[0], (), white)
-        known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), white)
+        trials, noise = stage.trials, stage.noise
+        nominal = refit_set(trials, nominal.points[0], (), noise)
+        known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), noise)
         if not rounds_left or (known is trials.bench and set(included) == looked_at):
             break
         # Nothing is searched again: what was found is refitted from where it is, under the noise that is left now.
-        stage = _look(trials._replace(bench=known), included, final, white)
+        stage = _look(trials._replace(bench=known), included, final, noise)
         looked_at = set(included)
-        included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.white)
+        included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
     gains, needless = _gains(stage, nominal)
     return _Weighed(stage, nominal, rivals, gains, needless, worth)
 
 
-def _settled_for_all(bench: Workbench, points, white: Whitening) -> tuple[Workbench, float]:
+def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
     """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them.
 
     The first is the best. Where another is far behind, its arithmetic counts as a part of that.
     """
     outputs_at = bench.stepped(points)
-    known = settled(bench, outputs_at, white.variances)
+    known = settled(bench, outputs_at, noise.innovation_variances)
     here = int(known.problem.substeps)
     coarse, fine = (
-        np.sum(white(known.problem.samples.outputs - outputs_at(substeps)) ** 2, axis=-1)
+        np.sum(noise.scaled(known.problem.samples.outputs - outputs_at(substeps)) ** 2, axis=-1)
         for substeps in (here, 2 * here)
     )
     behind = np.maximum(1.0, (fine - fine[0]) / _WEIGHED)
@@ -239,9 +235,9 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
     return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
 
 
-def _look(trials: Trials, included: tuple[int, ...], current: Refits, white: Whitening) -> Stage:
+def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> Stage:
     """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest."""
-    trials, current = _known(trials, included, current, white)
+    trials, current = _known(trials, included, current, noise)
     while True:
         bench = trials.bench
         measured = bench.problem.samples.measured
@@ -249,29 +245,29 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, white: Whi
             bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.parts
         )
         spanned = np.concatenate([current.slopes[0], tried.changes, trials.terms.responses])
-        white = noise_outside(current.residual[0], measured, spanned)
+        noise = noise_outside(current.residual[0], measured, spanned)
         before = trials
-        trials, current = _known(before, included, current, white)
+        trials, current = _known(before, included, current, noise)
         if trials is before:
             break
-    if white.coloured or white.variances.size > 1:
-        current = refit_set(trials, current.points[0], included, white)
-        tried = responses_at(bench, current, included, white, trials.parts)
+    if noise.coloured or noise.variances.size > 1:
+        current = refit_set(trials, current.points[0], included, noise)
+        tried = responses_at(bench, current, included, noise, trials.parts)
     else:
         # The variance of one record's and output's white noise does not move the best fit.
-        current = current._replace(cost=np.array([_cost_under(current, white)]))
-    return Stage(trials, included, current, white, screen(bench, current, tried, white, int(measured.sum()) // 2))
+        current = current._replace(cost=np.array([_cost_under(current, noise)]))
+    return Stage(trials, included, current, noise, screen(bench, current, tried, noise, int(measured.sum()) // 2))
 
 
-def _known(trials: Trials, included: tuple[int, ...], current: Refits, white: Whitening) -> tuple[Trials, Refits]:
+def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> tuple[Trials, Refits]:
     """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
     while True:
         bench = trials.bench
-        known = without_jumps(settled(bench, bench.stepped(current.points), white.variances), current, white)
+        known = without_jumps(settled(bench, bench.stepped(current.points), noise.innovation_variances), current, noise)
         if known is bench:
             return trials, current
         trials = trials._replace(bench=known)
-        only_known = plain_noise(white.variances, known.problem.samples.measured)
+        only_known = plain_noise(noise.variances, known.problem.samples.measured)
         current = refit_set(trials, current.points[0], included, only_known)
 
 
@@ -285,31 +281,30 @@ def _next_effect(stage: Stage) -> Stage | None:
     if not hopeful:
         return None
     best: Stage | None = None
-    without_form = strongest_dependence(stage.current, stage.white, trials.terms)
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
         some = hopeful[first : first + REFITTED_TOGETHER]
         names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
         more = ", ..." if len(some) > 3 else ""
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
-        refitted = refit_screened(trials, some, stage.included, stage.white, stage.current)
+        refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
         penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
-        chosen = int(np.argmin(np.where(np.isnan(penalised), np.inf, penalised)))
-        if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.white):
+        enough = [
+            stage.noise.gained(stage.current.residual[0], residual) > required_gain(bench, stage.screening, s.candidate)
+            for s, residual in zip(some, refitted.residual, strict=True)
+        ]
+        if not any(enough):
+            continue
+        chosen = int(np.argmin(np.where(enough & np.isfinite(penalised), penalised, np.inf)))
+        if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.noise):
             break
         candidate = some[chosen].candidate
-        gain = float(stage.current.cost[0] - refitted.cost[chosen])
-        if without_form > _BANK_LACKS_IT * max(gain, required_gain(bench, stage.screening, candidate)):
-            # A term of free form explains far more: the bank does not have what is missing.
-            continue
-        if not _is_gain(stage, refitted.of([chosen]), candidate):
-            continue
-        best = _look(trials, (*stage.included, candidate), refitted.of([chosen]), stage.white)
+        best = _look(trials, (*stage.included, candidate), refitted.of([chosen]), stage.noise)
         if not _leaves_something(best):
             break
-        reshaped = refit_reshaped(best.trials, best.current, best.included, candidate, best.white)
+        reshaped = refit_reshaped(best.trials, best.current, best.included, candidate, best.noise)
         if reshaped is not best.current:
-            best = _look(best.trials, best.included, reshaped, best.white)
+            best = _look(best.trials, best.included, reshaped, best.noise)
             if not _leaves_something(best):
                 break
     return best
@@ -321,40 +316,31 @@ def _leaves_something(stage: Stage) -> bool:
     return bool(left) and left[0].corrected < SIGNIFICANT
 
 
-def _cost_under(refits: Refits, white: Whitening) -> float:
-    return float(np.sum(white(refits.residual[0]) ** 2))
-
-
-def _is_gain(stage: Stage, extended: Refits, candidate: int) -> bool:
-    """Whether an effect gains enough, under the noise of the stage, and under that of what it leaves itself.
-
-    The latter counts as noise whatever the effect does not explain: it cannot be fooled by a noise that was taken to be
-    whiter than it is.
-    """
-    trials = stage.trials
-    required = required_gain(trials.bench, stage.screening, candidate)
-    removable = float(stage.current.cost[0]) - stage.white.used.sum()
-    # What takes only a little of a large misfit is not its cause.
-    if not stage.current.cost[0] - extended.cost[0] > max(required, _SHARE_OF_MISFIT * removable):
-        return False
-    own = noise_outside(extended.residual[0], trials.bench.problem.samples.measured, extended.slopes[0])
-    if not own.coloured and not stage.white.coloured:
-        return True
-    both = refit_sets(
-        trials, [[stage.current.points[0]], [extended.points[0]]], [stage.included, (*stage.included, candidate)], own
-    )
-    return bool(both.cost[0] - both.cost[1] > required)
+def _cost_under(refits: Refits, noise: Noise) -> float:
+    return float(np.sum(noise.scaled(refits.residual[0]) ** 2))
 
 
 def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None]:
-    """Return how much worse the fit is without each effect, and the one that is needed least, if it is needless."""
-    trials, final = stage.trials, stage.current
-    gains, spare = [], {}
+    """Return how much worse the fit is without each effect, and the one that is needed least, if it is needless.
+
+    It is if it gains less than chance could, or if data that were not used are predicted better without it by more
+    than chance.
+    """
+    trials, final, noise = stage.trials, stage.current, stage.noise
+    if not stage.included:
+        return (), None
+    sets, points, gains = [stage.included], [final.points[0]], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
-        gain = float(refit_set(trials, start, rest, stage.white).cost[0] - final.cost[0])
-        gains.append(gain)
-        spare[i] = gain - required_gain(trials.bench, stage.screening, i)
-    least = min(spare, key=lambda i: spare[i], default=None)
-    return tuple(gains), least if least is not None and spare[least] < 0.0 else None
+        refitted = refit_set(trials, start, rest, noise)
+        sets.append(rest)
+        points.append(refitted.points[0])
+        gains.append(noise.gained(refitted.residual[0], final.residual[0]))
+    unused = predicted(trials.bench, sets, np.stack(points), noise)
+    spare = {}
+    for i, gain, rest_predicts in zip(stage.included, gains, unused.residual[1:], strict=True):
+        contradicted = unused.noise.gained(unused.residual[0], rest_predicts, unused.doubt)
+        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - contradicted)
+    least = min(spare, key=lambda i: spare[i])
+    return tuple(gains), least if spare[least] < 0.0 else None

@@ -31,8 +31,9 @@ def smoothed(
     knots: Float[np.ndarray, " knot"],
     responses: Float[np.ndarray, "knot sample"],
     readings: Float[np.ndarray, " sample"],
+    least_variance: float = 1.0,
 ) -> Smooth:
-    """Return a curve through knots that explains whitened readings, as smooth as they say.
+    """Return a curve through knots that explains readings, as smooth as they say.
 
     Second derivatives are a priori normal numbers, whose variance has the largest marginal likelihood (Wahba 1985; the
     same as restricted maximum likelihood). What the readings cannot tell, such as a share of the curve that was
@@ -41,13 +42,14 @@ def smoothed(
     Args:
         knots: ascending; the curve is straight in between.
         responses: of the readings to the value at each knot.
-        readings: with noise of variance one, or more where the curve is not all that they hold.
+        readings: with noise, and what else the curve is not.
+        least_variance: of that noise along the responses.
 
     """
     from scipy.optimize import minimize_scalar
 
     raw = np.linalg.lstsq(responses.T, readings, rcond=_TOLD**0.5)[0]
-    variance = max(float(np.mean((readings - raw @ responses) ** 2)), 1.0)
+    variance = max(float(np.mean((readings - raw @ responses) ** 2)), least_variance)
     information = responses @ responses.T / variance
     along = responses @ readings / variance
     # In coordinates in which information is one, and roughness is diagonal (Demmler and Reinsch 1975).
@@ -85,7 +87,7 @@ def smoothed(
 
 
 def of_one_wave(responses: Float[np.ndarray, "phase sample"], readings: Float[np.ndarray, " sample"]) -> Smooth:
-    """Return the wave of some period that explains whitened readings best; two phases and a period have their price."""
+    """Return the wave of some period that explains readings best; two phases and a period have their price."""
     coefficients = np.linalg.lstsq(responses.T, readings, rcond=_TOLD**0.5)[0]
     left = float(np.sum((readings - coefficients @ responses) ** 2))
     evidence = float(readings @ readings) - left - _NUMBERS_OF_A_WAVE * float(np.log(len(readings)))

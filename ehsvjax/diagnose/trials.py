@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from ehsvjax.diagnose.curves import Terms, quantities, terms_at
 from ehsvjax.diagnose.frequencies import parts_of
-from ehsvjax.diagnose.noise import Whitening
+from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.parts import Parts
 from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits, bounds_of, padded, refit, span
@@ -69,7 +69,7 @@ def refit_sets(
     trials: Trials,
     starts: Sequence[Sequence[Float[np.ndarray, " parameter"]]],
     sets: Sequence[Sequence[int]],
-    white: Whitening,
+    noise: Noise,
     race: bool = False,
 ) -> Refits:
     """Refit each set of effects from each of its starts, and from where it has been refitted before; return the best.
@@ -81,7 +81,7 @@ def refit_sets(
     choices = [_different([*some, *_before(trials, s)]) for some, s in zip(starts, sets, strict=True)]
     of = np.repeat(np.arange(len(sets)), [len(choice) for choice in choices])
     columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
-    led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], white, race=race)
+    led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], noise, race=race)
     # Among its own: a set of which no start can be simulated is not to have another's refit.
     own = [np.flatnonzero(of == i) for i in range(len(sets))]
     found = led.of([int(rows[np.argmin(led.cost[rows])]) for rows in own])
@@ -91,18 +91,16 @@ def refit_sets(
     return found
 
 
-def refit_set(
-    trials: Trials, start: Float[np.ndarray, " parameter"], included: Sequence[int], white: Whitening
-) -> Refits:
+def refit_set(trials: Trials, start: Float[np.ndarray, " parameter"], included: Sequence[int], noise: Noise) -> Refits:
     """Refit one set of effects from one start; see `refit_sets`."""
-    return refit_sets(trials, [[start]], [included], white)
+    return refit_sets(trials, [[start]], [included], noise)
 
 
 def refit_screened(
     trials: Trials,
     some: Sequence[Screened],
     rest: Sequence[int],
-    white: Whitening,
+    noise: Noise,
     current: Refits,
     also: Sequence[Float[np.ndarray, " parameter"]] = (),
 ) -> Refits:
@@ -112,15 +110,13 @@ def refit_screened(
     points at which it is absent.
     """
     bench = trials.bench
-    starts = _most_promising(bench, [_starts(bench, s) for s in some], white, current)
-    grown = _grown(bench, some, [current.points[0], *also], white)
+    starts = _most_promising(bench, [_starts(bench, s) for s in some], noise, current)
+    grown = _grown(bench, some, [current.points[0], *also], noise)
     every = [[start, *points] for start, points in zip(starts, grown, strict=True)]
-    return refit_sets(trials, every, [(*rest, s.candidate) for s in some], white, race=True)
+    return refit_sets(trials, every, [(*rest, s.candidate) for s in some], noise, race=True)
 
 
-def refit_reshaped(
-    trials: Trials, current: Refits, included: Sequence[int], candidate: int, white: Whitening
-) -> Refits:
+def refit_reshaped(trials: Trials, current: Refits, included: Sequence[int], candidate: int, noise: Noise) -> Refits:
     """Refit from other shapes of one effect, if one leads lower: a stop's place and stiffness have many local minima.
 
     Frequencies are searched elsewhere.
@@ -137,7 +133,7 @@ def refit_reshaped(
     if not starts:
         return current
     columns = padded([bench.columns_with(included)] * len(starts), most_unknowns(bench))
-    found = refit(bench, np.stack(starts), columns, white)
+    found = refit(bench, np.stack(starts), columns, noise)
     best = found.of([int(np.argmin(found.cost))])
     if not best.cost[0] < current.cost[0]:
         return current
@@ -166,21 +162,26 @@ def _different(points: Sequence[Float[np.ndarray, " parameter"]]) -> list[Float[
 
 
 def _most_promising(
-    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], white: Whitening, current: Refits
+    bench: Workbench, choices: Sequence[Sequence[np.ndarray]], noise: Noise, current: Refits
 ) -> Float[np.ndarray, "individual parameter"]:
-    """Return of each list of points the one that would fit best after a linear refit of what `current` has."""
-    points = np.concatenate([np.stack(choice) for choice in choices])
-    r = white(bench.problem.samples.outputs - bench.simulated(points))
-    known = span(white(current.slopes[0]))
+    """Return of each list of points the one that would fit best after a linear refit of what `current` has.
+
+    Where an effect does nothing, as a limit that is never reached, no derivative leads on.
+    """
+    points = np.concatenate([current.points[:1], *(np.stack(choice) for choice in choices)])
+    without_it, *outputs = bench.simulated(points)
+    acts = np.array([not np.array_equal(with_it, without_it) for with_it in outputs])
+    r = noise.scaled(bench.problem.samples.outputs - np.stack(outputs))
+    known = span(noise.scaled(current.slopes[0]))
     r = r - (r @ known) @ known.T
     cost = np.sum(r**2, axis=1)
-    cost = np.where(np.isfinite(cost), cost, np.inf)
-    edges = np.cumsum([0, *(len(choice) for choice in choices)])
-    return np.stack([points[a + np.argmin(cost[a:b])] for a, b in itertools.pairwise(edges)])
+    cost = np.where(np.isfinite(cost) & acts, cost, np.inf)
+    edges = np.cumsum([1, *(len(choice) for choice in choices)])
+    return np.stack([points[a + np.argmin(cost[a - 1 : b - 1])] for a, b in itertools.pairwise(edges)])
 
 
 def _grown(
-    bench: Workbench, some: Sequence[Screened], points: Sequence[Float[np.ndarray, " parameter"]], white: Whitening
+    bench: Workbench, some: Sequence[Screened], points: Sequence[Float[np.ndarray, " parameter"]], noise: Noise
 ) -> list[list[Float[np.ndarray, " parameter"]]]:
     """Return for each candidate where its own numbers lead from points with nothing of it, all else as it is there.
 
@@ -202,7 +203,7 @@ def _grown(
             of.append(k)
     if not starts:
         return [[] for _ in some]
-    led = refit(bench, np.stack(starts), padded(columns, max(map(len, columns))), white, race=False).points
+    led = refit(bench, np.stack(starts), padded(columns, max(map(len, columns))), noise, race=False).points
     return [[point for point, i in zip(led, of, strict=True) if i == k] for k in range(len(some))]
 
 

@@ -11,8 +11,6 @@ from ehsvjax.diagnose.workbench import Workbench
 
 QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"
-# Share of what could be explained that must be, for causes to be named although something is left.
-_EXPLAINED = 0.9
 # Step of the readings' lattice, in deviations of the other noise, beyond which it is a cause.
 _COARSEST = 2.2
 
@@ -21,20 +19,17 @@ def verdict_of(examined: Examination) -> tuple[str, tuple[str, ...], tuple[Alter
     """Return the verdict, the causes and the alternatives."""
     selection = examined.selection
     groups = [
-        _names(selection, inseparable(selection.rivals[k], selection.gains[k], selection.white, examined.innocent))
-        for k in np.argsort([-gain for gain in selection.gains])
+        _names(selection, inseparable(selection.rivals[k])) for k in np.argsort([-gain for gain in selection.gains])
     ]
-    removed = float(selection.nominal.cost[0] - selection.final.cost[0])
-    left = max(examined.after[0].explained, 0.0)
-    explained = removed / max(removed + left, 1e-300)
-    if examined.lacking or (not examined.innocent and (not groups or explained < _EXPLAINED)):
+    if examined.lacking or not (examined.innocent or groups):
         return "unexplained", (), ()
     causes = tuple(group[0] for group in groups) + _quantised(selection)
     causes += (PROCESS_NOISE,) if examined.chance else ()
     if not causes:
         return "adequate", (), ()
     if examined.or_chance:
-        groups[0] = (*groups[0], PROCESS_NOISE)
+        # Instead of them all.
+        groups = [(*group, PROCESS_NOISE) for group in groups]
     alternatives = tuple(Alternative(g, _settled_by(selection.bench, g)) for g in groups if len(g) > 1)
     return ("ambiguous" if alternatives else "named"), causes, alternatives
 
@@ -46,7 +41,7 @@ def _names(selection: Selection, group: tuple[Rival, ...]) -> tuple[str, ...]:
 def _quantised(selection: Selection) -> tuple[str, ...]:
     samples, observed = selection.bench.problem.samples, selection.bench.problem.observed
     coarse: dict[str, None] = {}
-    for k, noises in enumerate(selection.white.noises):
+    for k, noises in enumerate(selection.noise.of):
         for i, name in enumerate(observed):
             step = lattice(samples.outputs[k, :, i][samples.measured[k, :, i]])
             if step is not None and step**2 > _COARSEST**2 * (noises[i].variance - step**2 / 12.0):

@@ -44,14 +44,26 @@ def verdict(diagnosis: "Diagnosis") -> str:
     """Return the verdict in a sentence."""
     left = "" if diagnosis.innocent else " Something is left that no candidate explains."
     if diagnosis.verdict == "adequate":
-        return "adequate. What the model leaves is noise: it depends on nothing that runs along the model."
+        coloured = any(m.coloured for outputs in diagnosis.misfit.by_record for m in outputs.values())
+        chance = " It is correlated: whether it is chance, a repeat of the experiment tells." if coloured else ""
+        return f"adequate. What the model leaves is noise: it depends on nothing that runs along the model.{chance}"
     if diagnosis.verdict == "named":
-        return f"{causes(diagnosis)}.{left}"
+        return f"{causes(diagnosis)}.{_explained(diagnosis)}{left}"
     if diagnosis.verdict == "ambiguous":
-        return f"ambiguous: {causes(diagnosis)}: {these(diagnosis)} cannot tell.{left}"
+        return f"ambiguous: {causes(diagnosis)}: {these(diagnosis)} cannot tell.{_explained(diagnosis)}{left}"
     better = "a single term explains the record better than several effects of the bank together"
     why = better if diagnosis.innocent else "no effect of the bank leaves an innocent residual"
     return f"unexplained. Something is missing, and {why}."
+
+
+def _explained(diagnosis: "Diagnosis") -> str:
+    """Return which share of what was wrong the causes explain on data that were not used, where chance could not."""
+    shares = {n: g.share_removed for n, g in diagnosis.gain.outputs.items() if g.share_interval[0] > 0.0}
+    if not shares:
+        return ""
+    each = [f"{100 * min(share, 1.0):.0f}%" + (f" ({name})" if len(diagnosis.gain.outputs) > 1 else "")
+            for name, share in shares.items()]  # fmt: skip
+    return f" {' and '.join(each)} of what was wrong is explained, on data that were not used."
 
 
 def causes(diagnosis: "Diagnosis") -> str:
@@ -94,16 +106,12 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
 def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
     lines = []
-    readings = sum(int(np.isfinite(m.residual).sum()) for of in diagnosis.misfit.by_record for m in of.values())
     included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
     for row in included.drop_duplicates("cause").itertuples():
         what = (
             _instead(diagnosis, str(row.cause)) or f"{row.cause} at {row.signal}: {_sizes(diagnosis, str(row.cause))}"
         )
-        lines.append(
-            f"{what}; without it the sum of squares over {readings} readings is {row.likelihood_gain:.4g} times the "
-            f"variance of that noise more"
-        )
+        lines.append(f"{what}; it gains {row.likelihood_gain:.4g} times what chance would")
     if diagnosis.process_noise is not None:
         place, intensity, *_ = diagnosis.process_noise
         unit = diagnosis.fit.model.unit(place)
