@@ -1,0 +1,40 @@
+"""Measured records of rigs with faults of their own, where they are at hand: what is known to be there is found."""
+
+import jax
+import pytest
+
+import ehsvjax
+from benchmarks.real_records import DATA, RIGS, judged
+
+pytestmark = pytest.mark.skipif(not DATA.exists(), reason="the measured records are not at hand")
+
+
+def diagnosed(name):
+    """Return the rig and the diagnosis of its records."""
+    rig = RIGS[name]()
+    fit = ehsvjax.identify(rig.model, list(rig.records), key=jax.random.key(0), population=40, generations=10)
+    return rig, ehsvjax.diagnose(fit, list(rig.records), key=jax.random.key(1))
+
+
+def test_a_lag_or_hysteresis_of_two_sweeps_is_found_and_predicts_each_from_the_other():
+    rig, found = diagnosed("leakage")
+    assert judged(rig, found) == "right", str(found)
+    assert {"input_hysteresis", "sensor_lag"} <= {name for a in found.alternatives for name in a.causes}
+    for gain in found.gain.by_record:
+        assert gain["flow"].rmse_after < min(0.0153, gain["flow"].rmse_before)
+
+
+def test_a_tank_that_overflows_is_found_and_another_record_predicted():
+    rig, found = diagnosed("tanks")
+    assert judged(rig, found).startswith("right"), str(found)
+    (other,) = rig.others
+    assert found.extended.score(other).rmse["level"] < 0.45 < found.fit.score(other).rmse["level"]
+
+
+def test_dry_friction_comes_before_the_gap_and_another_amplitude_is_predicted():
+    rig, found = diagnosed("damper")
+    assert judged(rig, found).startswith("right"), str(found)
+    assert found.causes[0] == "coulomb_friction"
+    assert any("dead_zone" in names for names in (found.causes, *(a.causes for a in found.alternatives)))
+    (other,) = rig.others
+    assert found.extended.score(other).fit_percent["force"] > 84.0
