@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 
 from ehsvjax.diagnose.noise import Noise
 from ehsvjax.diagnose.refits import Refits, padded, refit
-from ehsvjax.diagnose.workbench import TOLD_APART, Workbench
+from ehsvjax.diagnose.workbench import Workbench
 
 HELD_BACK = 0.3
 """Share of a single record's readings that is predicted from the others, the last."""
@@ -20,14 +20,11 @@ class Predicted(NamedTuple):
     Attributes:
         residual: `[set, record, time, signal]` measured minus predicted.
         noise: of the model, for the readings that were predicted.
-        doubt: `[direction, sample]` what the first set does not know of its predictions, scaled: what each direction of
-            its parameters' errors does to them.
 
     """
 
     residual: Float[np.ndarray, "set record time signal"]
     noise: Noise
-    doubt: Float[np.ndarray, "direction sample"]
 
 
 def predicted(
@@ -55,44 +52,25 @@ def predicted(
         later = np.zeros_like(noise.measured)
         later[:, int(np.searchsorted(counted, (1.0 - HELD_BACK) * counted[-1])) :] = True
         found = _refitted(bench, starts, columns, noise, ~later)
-        unused = noise._replace(measured=noise.measured & later)
-        return Predicted(found.residual, unused, _doubt(found.slopes[0], noise, ~later, unused))
-    residual, doubts = np.empty((len(sets), *noise.measured.shape)), []
+        return Predicted(found.residual, noise._replace(measured=noise.measured & later))
+    residual = np.empty((len(sets), *noise.measured.shape))
     for k in range(len(bench.records)):
         this = np.zeros_like(noise.measured)
         this[k] = True
-        others = _refitted(bench, starts, columns, noise, ~this)
-        residual[:, k] = _left_out(bench, k, others, this, noise)[:, k]
-        known = ~np.isin(others.chosen[0], _of_record(bench, k))
-        doubts.append(_doubt(others.slopes[0][known], noise, ~this, noise, this))
-    return Predicted(residual, noise, np.concatenate(doubts))
+        residual[:, k] = _left_out(bench, k, _refitted(bench, starts, columns, noise, ~this), this, noise)[:, k]
+    return Predicted(residual, noise)
 
 
 def _refitted(bench: Workbench, starts, columns, noise: Noise, used: Bool[np.ndarray, "record time signal"]) -> Refits:
     return refit(bench, starts, columns, noise._replace(measured=noise.measured & used), race=False)
 
 
-def _doubt(slopes, noise: Noise, used, unused: Noise, there=True) -> Float[np.ndarray, "direction sample"]:
-    """Return what errors of the unknowns, as the used readings leave them, do to predictions, one deviation each."""
-    known = noise._replace(measured=noise.measured & used).scaled(slopes)
-    ahead = unused.scaled(np.where(there, slopes, 0.0))
-    size = np.sqrt(np.sum(known**2, axis=1) + np.sum(ahead**2, axis=1))
-    shown = size > 0.0
-    known, ahead = known[shown] / size[shown, None], ahead[shown] / size[shown, None]
-    values, vectors = np.linalg.eigh(known @ known.T)
-    return vectors.T @ ahead / np.sqrt(np.maximum(values, TOLD_APART**2))[:, None]
-
-
-def _of_record(bench: Workbench, record: int) -> list[int]:
-    """Columns of what a record has for itself."""
-    return [j for j, name in enumerate(bench.problem.names) if name.endswith(f"[{record}]")]
-
-
 def _left_out(
     bench: Workbench, record: int, others: Refits, this: Bool[np.ndarray, "record time signal"], noise: Noise
 ) -> Float[np.ndarray, "set record time signal"]:
     """Return the residuals of a record that was left out, its initial conditions refitted to it."""
-    points, of_record = others.points.copy(), _of_record(bench, record)
+    points = others.points.copy()
+    of_record = [j for j, name in enumerate(bench.problem.names) if name.endswith(f"[{record}]")]
     initial = [j for j in of_record if j in bench.base_columns]
     points[:, of_record] = np.where(np.isin(of_record, initial), points[:, of_record], bench.nominal[of_record])
     return _refitted(bench, points, padded([initial] * len(points), max(len(initial), 1)), noise, this).residual

@@ -31,7 +31,7 @@ def smoothed(
     knots: Float[np.ndarray, " knot"],
     responses: Float[np.ndarray, "knot sample"],
     readings: Float[np.ndarray, " sample"],
-    least_variance: float = 1.0,
+    colour: float = 1.0,
 ) -> Smooth:
     """Return a curve through knots that explains readings, as smooth as they say.
 
@@ -43,13 +43,13 @@ def smoothed(
         knots: ascending; the curve is straight in between.
         responses: of the readings to the value at each knot.
         readings: with noise, and what else the curve is not.
-        least_variance: of that noise along the responses.
+        colour: variance along the responses of what the curve leaves, over its variance: one if that is white.
 
     """
     from scipy.optimize import minimize_scalar
 
     raw = np.linalg.lstsq(responses.T, readings, rcond=_TOLD**0.5)[0]
-    variance = max(float(np.mean((readings - raw @ responses) ** 2)), least_variance)
+    variance = colour * float(np.mean((readings - raw @ responses) ** 2))
     information = responses @ responses.T / variance
     along = responses @ readings / variance
     # In coordinates in which information is one, and roughness is diagonal (Demmler and Reinsch 1975).
