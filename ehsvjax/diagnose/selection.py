@@ -337,8 +337,7 @@ def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None
         gains.append(noise.gained(refitted.residual[0], final.residual[0]))
     unused = predicted(trials.bench, sets, np.stack(points), noise)
     spare = {}
-    for i, gain, rest_predicts in zip(stage.included, gains, unused.residual[1:], strict=True):
-        contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
-        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - contradicted)
+    for k, (i, gain) in enumerate(zip(stage.included, gains, strict=True), 1):
+        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - unused.worse(k))
     least = min(spare, key=lambda i: spare[i])
     return tuple(gains), least if spare[least] < 0.0 else None
