@@ -136,16 +136,6 @@ def test_what_makes_the_same_record_stays_one_group_beside_an_effect_that_turns_
 
 
 @of_the_oscillator
-def test_two_causes_that_chance_explains_about_as_well_are_told_with_it():
-    """A harmonic force and a drift, worth 41 more than a random force, of which their numbers' price leaves nothing."""
-    (made,) = records([Hidden("van_der_pol", "white", 0.01, ("harmonic_force", "parameter_drift"), 1455613565)])
-    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
-    fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=50, generations=20)
-    found = diagnose(fit, record, key=jax.random.key(0))
-    assert {"harmonic_force", "parameter_drift", "process_noise"} <= held(found), str(found)
-
-
-@of_the_oscillator
 def test_a_sensor_that_ends_just_below_the_peaks_is_named():
     """Of an oscillator far from the paper's, that never reaches the limit where the search for it could begin."""
     rng = np.random.default_rng(3)

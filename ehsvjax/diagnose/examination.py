@@ -133,7 +133,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     price = float(np.log(noise.measured.sum()))
     better = noise.gained(selection.final.residual[0], term.residual)
     better += price * sum(_numbers(selection, i) for i in causes)
-    return (term if better > -INSEPARABLE else None), better > price * term.pieces
+    return (term if better > -INSEPARABLE else None), bool(better > price * term.pieces)
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:

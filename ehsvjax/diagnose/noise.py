@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ehsvjax.diagnose.significance import SIGNIFICANT
 from ehsvjax.precision.residual_noise import (
     ResidualNoise,
     absorbed_by_the_fit,
@@ -20,8 +19,8 @@ from ehsvjax.precision.residual_noise import (
 
 # Directions of the candidates' responses below this share of the largest are counted as noise.
 _NEGLIGIBLE = 1e-3
-# Of a record, between which an explanation's gain may differ; what is left may last for several of the short ones.
-_PARTS = (20, 10, 5)
+# Of a record, between which an explanation's gain may differ.
+_PARTS = 20
 # A sample stands alone if it differs from its neighbours by this many deviations of a difference.
 _SPIKE = 4.0
 
@@ -69,19 +68,17 @@ class Noise(NamedTuple):
         """Return by how much one explanation's residual is less than another's, in variances of what is left.
 
         The difference of their sums of squares, over the variance of the better one's residual along what the two do
-        differently: that of the noise, or, if it is more, as it differs between parts of the records, short and long.
-        Where noise alone is left, this is twice the logarithm of the likelihood ratio. Where more is left, whatever is
-        flexible gains by it, and what it gains in one part it loses in another (Wald's test with the covariance of
-        White 1982, "Maximum likelihood estimation of misspecified models", and for rivals Vuong 1989, "Likelihood ratio
-        tests for model selection and non-nested hypotheses", with parts for samples, as what is left is correlated).
+        differently: that of the noise, or, if it is more, as it differs from part to part of the records. Where noise
+        alone is left, this is twice the logarithm of the likelihood ratio. Where more is left, whatever is flexible
+        gains by it, and what it gains in one part it loses in another (Wald's test with the covariance of White 1982,
+        "Maximum likelihood estimation of misspecified models", and for rivals Vuong 1989, "Likelihood ratio tests for
+        model selection and non-nested hypotheses", with parts for samples, as what is left is correlated).
 
         Args:
             left: measured minus simulated, by the one; in the outputs' units. What is not finite is infinitely worse.
             more: by the other.
 
         """
-        from scipy.special import chdtri
-
         both = self.scaled(left), self.scaled(more)
         squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in both]
         if not all(map(np.isfinite, squares)):
@@ -90,14 +87,8 @@ class Noise(NamedTuple):
         square = float(change @ change)
         if not square > 0.0:
             return 0.0
-        of_noise = self.along(change)
-        variances = [of_noise]
-        for parts in _PARTS:
-            sums = np.bincount(self._part_of(parts), change * best)
-            # As much as noise alone varies in all but few of such sums is no more than noise.
-            if np.sum(sums**2) / square > of_noise * chdtri(len(sums), SIGNIFICANT) / len(sums):
-                variances.append(float(np.sum(sums**2)) / square)
-        return (squares[0] - squares[1]) / max(variances)
+        between_parts = float(np.sum(np.bincount(self._part_of, change * best) ** 2)) / square
+        return (squares[0] - squares[1]) / max(self.along(change), between_parts)
 
     def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
         """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""
@@ -155,11 +146,12 @@ class Noise(NamedTuple):
     def _in_turn(self) -> Bool[np.ndarray, "signal record time"]:
         return np.moveaxis(self.measured, -1, 0)
 
-    def _part_of(self, parts: int) -> Int[np.ndarray, " sample"]:
-        """Return the part of its record in which each scaled reading lies, counted on from record to record."""
+    @property
+    def _part_of(self) -> Int[np.ndarray, " sample"]:
+        """The part of its record in which each scaled reading lies, counted on from record to record."""
         counted = np.cumsum(self.measured.any(axis=-1), axis=1)
-        within = np.maximum(counted - 1, 0) * parts // np.maximum(counted[:, -1:], 1)
-        return np.broadcast_to(within + parts * np.arange(len(within))[:, None], self._in_turn.shape)[self._in_turn]
+        within = np.maximum(counted - 1, 0) * _PARTS // np.maximum(counted[:, -1:], 1)
+        return np.broadcast_to(within + _PARTS * np.arange(len(within))[:, None], self._in_turn.shape)[self._in_turn]
 
 
 def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample"]:

@@ -26,17 +26,6 @@ class Predicted(NamedTuple):
     residual: Float[np.ndarray, "set record time signal"]
     noise: Noise
 
-    def worse(self, than: int) -> float:
-        """Return the noise variances by which the first set predicts worse than another; what is not finite is so.
-
-        Nothing was fitted to these readings, so that no flexibility has to be made up for.
-        """
-        first, other = (self.noise.scaled(self.residual[k]) for k in (0, than))
-        squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in (first, other)]
-        if not all(map(np.isfinite, squares)) or squares[0] == squares[1]:
-            return 0.0 if squares[0] == squares[1] else squares[0] - squares[1]
-        return (squares[0] - squares[1]) / self.noise.along(first - other)
-
 
 def predicted(
     bench: Workbench,

@@ -15,7 +15,7 @@ from ehsvjax.diagnose.progress import Progress
 from ehsvjax.diagnose.refits import Refits
 from ehsvjax.diagnose.rivals import PER_NUMBER, Rival, price, rivals_again, rivals_of_all
 from ehsvjax.diagnose.screening import Screening, responses_at, screen
-from ehsvjax.diagnose.significance import INSEPARABLE, SIGNIFICANT
+from ehsvjax.diagnose.significance import INSEPARABLE
 from ehsvjax.diagnose.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -28,6 +28,8 @@ from ehsvjax.diagnose.trials import (
 )
 from ehsvjax.diagnose.workbench import Workbench, prepared, settled
 
+SIGNIFICANT = 0.002
+"""Corrected p-value of the whole search below which an effect is taken to be there."""
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
 _ROUNDS = 6
@@ -337,7 +339,8 @@ def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None
         gains.append(noise.gained(refitted.residual[0], final.residual[0]))
     unused = predicted(trials.bench, sets, np.stack(points), noise)
     spare = {}
-    for k, (i, gain) in enumerate(zip(stage.included, gains, strict=True), 1):
-        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - unused.worse(k))
+    for i, gain, rest_predicts in zip(stage.included, gains, unused.residual[1:], strict=True):
+        contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
+        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - contradicted)
     least = min(spare, key=lambda i: spare[i])
     return tuple(gains), least if spare[least] < 0.0 else None

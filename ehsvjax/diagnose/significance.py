@@ -11,8 +11,6 @@ INSEPARABLE = 3.0**2
 Where the true cause can be expected to be 5^2 better than a rival, chance brings the refits as near as 3^2 in 2% of
 all records (3.5^2 in 7%); a rival that is 3^2 better than the true cause is as rare as three standard deviations.
 """
-SIGNIFICANT = 0.002
-"""Corrected p-value of the whole search below which an effect is taken to be there."""
 _DRAWS = 20_000
 # Draws below which a share of all draws says little.
 _FEW = 20
