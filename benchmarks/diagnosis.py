@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 
 import ehsvjax
 from benchmarks.processes import rows_of
-from ehsvjax.diagnose import Diagnosis, diagnose
-from ehsvjax.diagnose.missing import MissingTerm
+from ehsvjax.diagnosis import Diagnosis, diagnose
+from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
 from tests.hidden_oracle import SEPARABLE, oracle, worth_each
 from tests.hidden_plants import effect_sizes
 from tests.hidden_records import TRUTH, Hidden, Made, records, true_term

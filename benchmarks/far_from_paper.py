@@ -26,7 +26,7 @@ import pandas as pd
 import ehsvjax
 from benchmarks.processes import rows_of
 from benchmarks.several_outputs import outcome
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnosis import diagnose
 from tests.hidden_plants import EFFECTS, Valve, effect_sizes, held_levels, servovalve_with, van_der_pol_with
 from tests.hidden_records import ONE_SIDED, TRUTH
 

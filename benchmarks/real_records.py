@@ -23,7 +23,7 @@ import pandas as pd
 
 import ehsvjax
 from benchmarks import real_models
-from ehsvjax.diagnose import Diagnosis
+from ehsvjax.diagnosis import Diagnosis
 
 DATA = Path(os.environ.get("EHSVJAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

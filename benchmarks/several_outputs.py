@@ -24,7 +24,7 @@ from scipy.optimize import least_squares
 
 import ehsvjax
 from benchmarks.processes import rows_of
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnosis import diagnose
 from tests.hidden_plants import SERVOVALVE_EFFECTS, servovalve_with
 from tests.hidden_records import Hidden, sizes_of
 from tests.plants import Valve, held_levels, servovalve_plant

@@ -16,7 +16,7 @@ conditions included), generation, time (a sample), signal (an output). SI units 
 
 from ehsvjax import effects, excitation, hydraulics, operators
 from ehsvjax.columns import Column
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnosis import diagnose
 from ehsvjax.effects import Effect
 from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators

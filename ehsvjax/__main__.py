@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from ehsvjax import effects, excitation, paper
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnosis import diagnose
 from ehsvjax.identify import identify
 from ehsvjax.models import servovalve, van_der_pol
 from ehsvjax.paper import Identification

@@ -127,3 +127,21 @@ def test_imports_point_down_only(room, never):
     assert {f"ehsvjax.{name}" for name in never} & _imported(f"ehsvjax.{room}") == set()
     for top in ("report", "plots", "__main__"):
         assert f"ehsvjax.{top}" not in _imported(f"ehsvjax.{room}")
+
+
+# The rooms of a diagnosis, from the top down.
+ROOMS = ("recipe", "results", "decision", "hypotheses", "bench")
+
+
+def test_rooms_of_a_diagnosis_import_down_only():
+    rooms = {name: name.split(".")[2] for name in MODULES if name.startswith("ehsvjax.diagnosis.")}
+    assert set(rooms.values()) == set(ROOMS)
+    for name, room in rooms.items():
+        above = {other for other in rooms if ROOMS.index(rooms[other]) < ROOMS.index(room)}
+        assert not above & _imported(name), name
+
+
+def test_rooms_of_a_diagnosis_have_no_circles():
+    for name in MODULES:
+        if name.startswith("ehsvjax.diagnosis."):
+            assert name not in _imported(name)

@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ehsvjax
-from ehsvjax.diagnose import Alternative
+from ehsvjax.diagnosis import Alternative
 from ehsvjax.effects import BANK, amplitude, attach, effects_of
 from tests.compilations import compilations
 

@@ -7,12 +7,13 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
-from ehsvjax.diagnose.curves import _all_waves, knots_along, single_waves
-from ehsvjax.diagnose.dependence import _log_of_chi_square
-from ehsvjax.diagnose.gain import _gain
-from ehsvjax.diagnose.noise import Noise, lattice, noise_outside, plain_noise, spikes
-from ehsvjax.diagnose.significance import INSEPARABLE, corrected, smallest_p_values
-from ehsvjax.diagnose.suspects import _least_size
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
+from ehsvjax.diagnosis.bench.readings import lattice, spikes
+from ehsvjax.diagnosis.bench.significance import INSEPARABLE, corrected, smallest_p_values
+from ehsvjax.diagnosis.hypotheses.curves import _all_waves, knots_along, single_waves
+from ehsvjax.diagnosis.hypotheses.dependence import _log_of_chi_square
+from ehsvjax.diagnosis.results.gain import _gain
+from ehsvjax.diagnosis.results.suspects import _least_size
 from ehsvjax.precision.residual_noise import ResidualNoise
 
 

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose.noise import plain_noise
-from ehsvjax.diagnose.refits import bounds_of, padded, refit
-from ehsvjax.diagnose.screening import responses_at, screen
-from ehsvjax.diagnose.significance import INSEPARABLE
-from ehsvjax.diagnose.trials import most_unknowns, refit_sets, trials_of
-from ehsvjax.diagnose.workbench import workbench
+from ehsvjax.diagnosis.bench.noise import plain_noise
+from ehsvjax.diagnosis.bench.refits import bounds_of, padded, refit
+from ehsvjax.diagnosis.bench.significance import INSEPARABLE
+from ehsvjax.diagnosis.bench.workbench import workbench
+from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
+from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen
 from ehsvjax.effects import BANK
 from tests.plants import held_levels, servovalve_plant
 

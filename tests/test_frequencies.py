@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose.frequencies import parts_of, with_frequencies
-from ehsvjax.diagnose.noise import plain_noise
-from ehsvjax.diagnose.refits import padded, refit
-from ehsvjax.diagnose.workbench import workbench
+from ehsvjax.diagnosis.bench.noise import plain_noise
+from ehsvjax.diagnosis.bench.refits import padded, refit
+from ehsvjax.diagnosis.bench.workbench import workbench
+from ehsvjax.diagnosis.hypotheses.harmonics import parts_of, with_frequencies
 from ehsvjax.effects import BANK
 from tests.hidden_plants import van_der_pol_with
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose import Diagnosis, diagnose
+from ehsvjax.diagnosis import Diagnosis, diagnose
 from tests.hidden_oracle import worth
 from tests.hidden_plants import effect_sizes, held_levels, van_der_pol_with
 from tests.hidden_records import Hidden, records

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose.jumps import without_jumps
-from ehsvjax.diagnose.noise import plain_noise
-from ehsvjax.diagnose.refits import padded, refit
-from ehsvjax.diagnose.workbench import workbench
+from ehsvjax.diagnosis.bench.jumps import without_jumps
+from ehsvjax.diagnosis.bench.noise import plain_noise
+from ehsvjax.diagnosis.bench.refits import padded, refit
+from ehsvjax.diagnosis.bench.workbench import workbench
 from ehsvjax.effects import BANK
 from ehsvjax.models.model import Model, Parameter, Signal
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ehsvjax.diagnose.curves import Curve
-from ehsvjax.diagnose.missing import _damped_steps, _free, _least, _outside
-from ehsvjax.diagnose.refits import span
+from ehsvjax.diagnosis.bench.refits import span
+from ehsvjax.diagnosis.hypotheses.curves import Curve
+from ehsvjax.diagnosis.hypotheses.missing import _damped_steps, _free, _least, _outside
 
 TIME = np.linspace(0.0, 1.0, 800)
 ALONG = np.sin(9.0 * TIME)

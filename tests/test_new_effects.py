@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 import ehsvjax
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnosis import diagnose
 from ehsvjax.effects import BANK, attach, candidates
 from ehsvjax.effects.internal import contexts_of
 from tests.plants import held_levels

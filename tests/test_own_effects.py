@@ -9,7 +9,7 @@ import pytest
 
 import ehsvjax
 from ehsvjax import Effect
-from ehsvjax.diagnose import diagnose, recipe
+from ehsvjax.diagnosis import diagnose, recipe
 from ehsvjax.effects import amplitude
 from ehsvjax.effects.effect import EffectParameter, constant
 from tests.plants import held_levels

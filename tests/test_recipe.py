@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose import diagnose, recipe
-from ehsvjax.diagnose.gain import _gain
-from ehsvjax.diagnose.progress import bar
+from ehsvjax.diagnosis import diagnose, recipe
+from ehsvjax.diagnosis.bench.progress import bar
+from ehsvjax.diagnosis.results.gain import _gain
 from tests.plants import held_levels
 from tests.small_models import STIFFNESS, carriage, carriage_plant, record_of
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose import Diagnosis, diagnose
+from ehsvjax.diagnosis import Diagnosis, diagnose
 from tests.hidden_plants import held_levels, servovalve_with, van_der_pol_with
 from tests.small_models import STIFFNESS, carriage, carriage_plant, record_of
 

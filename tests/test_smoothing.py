@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
 
-from ehsvjax.diagnose.smoothing import of_one_wave, smoothed
+from ehsvjax.diagnosis.hypotheses.smoothing import of_one_wave, smoothed
 
 KNOTS = np.cumsum(np.random.default_rng(0).uniform(0.01, 0.09, 60)) - 1.0
 ALONG = np.random.default_rng(1).uniform(KNOTS[0], KNOTS[-1], 3000)

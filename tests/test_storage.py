@@ -16,7 +16,7 @@ import pytest
 
 import ehsvjax
 from ehsvjax import Fit, Record, storage
-from ehsvjax.diagnose import Diagnosis
+from ehsvjax.diagnosis import Diagnosis
 from ehsvjax.effects import BANK, Effect, amplitude, attach, effects_of
 from ehsvjax.effects.effect import constant
 from tests import hand_made
@@ -232,7 +232,7 @@ def test_what_is_no_model_or_no_effect_is_refused(handed, tmp_path):
 
 PROCESS = """
 import sys
-from ehsvjax.diagnose import Diagnosis
+from ehsvjax.diagnosis import Diagnosis
 diagnosis = Diagnosis.load(sys.argv[1])
 diagnosis.report(sys.argv[2])
 print(diagnosis)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose import diagnose
+from ehsvjax.diagnosis import diagnose
 from tests.plants import held_levels, servovalve_plant
 
 pytestmark = pytest.mark.xdist_group("diagnoses of the servovalve")

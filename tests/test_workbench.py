@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnose.curves import bench_with, outputs_with, probe_at, quantities, straight_along
-from ehsvjax.diagnose.noise import plain_noise
-from ehsvjax.diagnose.refits import padded, refit
-from ehsvjax.diagnose.screening import Screened
-from ehsvjax.diagnose.selection import _look, _weighed
-from ehsvjax.diagnose.trials import refit_screened, refit_sets, trials_of
-from ehsvjax.diagnose.workbench import _simulated, workbench
+from ehsvjax.diagnosis.bench.noise import plain_noise
+from ehsvjax.diagnosis.bench.refits import padded, refit
+from ehsvjax.diagnosis.bench.workbench import _simulated, workbench
+from ehsvjax.diagnosis.decision.search import _look, _weighed
+from ehsvjax.diagnosis.decision.trials import refit_screened, refit_sets, trials_of
+from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
+from ehsvjax.diagnosis.hypotheses.screening import Screened
 from ehsvjax.effects import BANK
 from ehsvjax.population import cast, simulated
 

@@ -15,7 +15,7 @@ from ehsvjax.storage import version_1
 from ehsvjax.storage.trees import Tree, as_tree, from_tree
 
 if TYPE_CHECKING:
-    from ehsvjax.diagnose.diagnosis import Diagnosis
+    from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 
 _DAMAGED = "take another copy, or save it again"
 
@@ -52,7 +52,7 @@ def load_diagnosis(path: str | os.PathLike, model: Model | None = None, bank: Se
         OSError: if the file is not there or may not be read.
 
     """
-    from ehsvjax.diagnose.diagnosis import Diagnosis
+    from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 
     _check_handed(model, bank)
     return _load(path, Diagnosis, "a diagnosis written by Diagnosis.save", model, bank)

@@ -1,0 +1,247 @@
+"""The noise of records that a model does not explain yet: spikes, lattices, and correlated noise told from misfit.
+
+A residual is noise and misfit together. What candidate causes could have done lies in the space of their responses, so
+that noise is judged by what is left of the residual outside that space: a model's misfit is then not taken for coloured
+noise, nor coloured noise for a misfit.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ehsvjax.precision.residual_noise import (
+    ResidualNoise,
+    absorbed_by_the_fit,
+    meat,
+    residual_noise,
+)
+
+# Directions of the candidates' responses below this share of the largest are counted as noise.
+_NEGLIGIBLE = 1e-3
+# Of a record, between which an explanation's gain may differ.
+_PARTS = 20
+
+
+class Noise(NamedTuple):
+    """What a model leaves if it is right: of each output in each record, white or an autoregression.
+
+    Refits are by least squares, which no noise deceives; what differs between two of them counts in the variance of
+    what is left along that difference. Only tests of whether noise alone is left ask for innovations.
+
+    Attributes:
+        of: `[record][signal]` the noise of each output, in its unit.
+        measured: `[record, time, signal]` readings that count.
+
+    """
+
+    of: tuple[tuple[ResidualNoise, ...], ...]
+    measured: Bool[np.ndarray, "record time signal"]
+
+    def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return the readings that count in deviations of the noise, one output after the other."""
+        return np.moveaxis(series / np.sqrt(self.variances)[:, None], -1, -3)[..., self._in_turn]
+
+    def innovations(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return what is new in each reading, in its deviations: white and of variance one, if the series is noise.
+
+        A reading needs those before it.
+        """
+        from scipy.signal import lfilter  # slow to import
+
+        parts, known = [], self.known
+        for i, k in np.ndindex(self.measured.shape[-1], self.measured.shape[0]):
+            noise, whitened = self.of[k][i], series[..., k, :, i]
+            order = len(noise.coefficients)
+            if order:
+                first = whitened[..., :order] @ _first_innovations(noise).T
+                whitened = lfilter(np.concatenate([[1.0], -noise.coefficients]), 1.0, whitened, axis=-1)
+                whitened[..., :order] = first
+            parts.append(whitened[..., known[k, :, i]] / np.sqrt(noise.innovation_variance))
+        return np.concatenate(parts, axis=-1)
+
+    def gained(
+        self, left: Float[np.ndarray, "record time signal"], more: Float[np.ndarray, "record time signal"]
+    ) -> float:
+        """Return by how much one explanation's residual is less than another's, in variances of what is left.
+
+        The difference of their sums of squares, over the variance of the better one's residual along what the two do
+        differently: that of the noise, or, if it is more, as it differs from part to part of the records. Where noise
+        alone is left, this is twice the logarithm of the likelihood ratio. Where more is left, whatever is flexible
+        gains by it, and what it gains in one part it loses in another (Wald's test with the covariance of White 1982,
+        "Maximum likelihood estimation of misspecified models", and for rivals Vuong 1989, "Likelihood ratio tests for
+        model selection and non-nested hypotheses", with parts for samples, as what is left is correlated).
+
+        Args:
+            left: measured minus simulated, by the one; in the outputs' units. What is not finite is infinitely worse.
+            more: by the other.
+
+        """
+        both = self.scaled(left), self.scaled(more)
+        squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in both]
+        if not all(map(np.isfinite, squares)):
+            return 0.0 if squares[0] == squares[1] else squares[0] - squares[1]
+        best, change = both[int(np.argmin(squares))], both[0] - both[1]
+        square = float(change @ change)
+        if not square > 0.0:
+            return 0.0
+        between_parts = float(np.sum(np.bincount(self._part_of, change * best) ** 2)) / square
+        return (squares[0] - squares[1]) / max(self.along(change), between_parts)
+
+    def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
+        """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""
+        if not self.coloured:
+            return 1.0
+        flat = directions.reshape(-1, directions.shape[-1])
+        series = np.zeros((*self._in_turn.shape, len(flat)))
+        series[self._in_turn] = flat.T
+        through = sum(
+            float(np.trace(meat(series[i, k][None], noise))) / noise.variance
+            for k, of_record in enumerate(self.of) for i, noise in enumerate(of_record)
+        )  # fmt: skip
+        return through / float(np.sum(flat**2))
+
+    @property
+    def known(self) -> Bool[np.ndarray, "record time signal"]:
+        """Readings whose innovation can be computed: those before them are measured too."""
+        known = self.measured.copy()
+        for k, i in np.ndindex(*_channels(known)):
+            coefficients = self.of[k][i].coefficients
+            order = len(coefficients)
+            for lag in range(1, order + 1):
+                if coefficients[lag - 1] != 0.0:
+                    known[k, lag:, i] &= self.measured[k, :-lag, i]
+            # The first samples are made white together.
+            known[k, :order, i] &= self.measured[k, :order, i].all()
+        return known
+
+    @property
+    def variances(self) -> Float[np.ndarray, "record signal"]:
+        """Of each output's noise, in its unit squared."""
+        return np.array([[noise.variance for noise in of_record] for of_record in self.of])
+
+    @property
+    def innovation_variances(self) -> Float[np.ndarray, "record signal"]:
+        """Of the innovations of each output, in its unit squared: of what a sample tells alone."""
+        return np.array([[noise.innovation_variance for noise in of_record] for of_record in self.of])
+
+    def variance_of(self, signal: int) -> float:
+        """Return the variance of one output's noise, the mean over the records."""
+        counts = self.measured[..., signal].sum(axis=1)
+        return float(np.average(self.variances[:, signal], weights=np.maximum(counts, 1e-9)))
+
+    @property
+    def log_units(self) -> float:
+        """Sum of the logarithms of the innovations' variances: what likelihoods of innovations leave out."""
+        return float(np.sum(self.known.sum(axis=1) * np.log(self.innovation_variances)))
+
+    @property
+    def coloured(self) -> bool:
+        """Whether any output's noise is correlated."""
+        return any(len(noise.coefficients) for of_record in self.of for noise in of_record)
+
+    @property
+    def _in_turn(self) -> Bool[np.ndarray, "signal record time"]:
+        return np.moveaxis(self.measured, -1, 0)
+
+    @property
+    def _part_of(self) -> Int[np.ndarray, " sample"]:
+        """The part of its record in which each scaled reading lies, counted on from record to record."""
+        counted = np.cumsum(self.measured.any(axis=-1), axis=1)
+        within = np.maximum(counted - 1, 0) * _PARTS // np.maximum(counted[:, -1:], 1)
+        return np.broadcast_to(within + _PARTS * np.arange(len(within))[:, None], self._in_turn.shape)[self._in_turn]
+
+
+def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample"]:
+    """Return what makes the first samples of an autoregression, which none come before, white like the others."""
+    order = len(noise.coefficients)
+    covariance = np.real(np.fft.ifft(noise.spectrum(8192)))[:order]
+    toeplitz = covariance[np.abs(np.subtract.outer(np.arange(order), np.arange(order)))]
+    root = np.linalg.cholesky(toeplitz + 1e-12 * covariance[0] * np.eye(order))
+    return np.sqrt(noise.innovation_variance) * np.linalg.inv(root)
+
+
+def plain_noise(
+    variances: Float[np.ndarray, "*record signal"], measured: Bool[np.ndarray, "record time signal"]
+) -> Noise:
+    """Return white noise of these variances, in the outputs' units squared: least squares as `identify` does them."""
+    return Noise(tuple(tuple(map(_white, row)) for row in np.broadcast_to(variances, _channels(measured))), measured)
+
+
+def _white(variance: float) -> ResidualNoise:
+    return ResidualNoise(float("nan"), np.zeros(0), float(variance), float(variance))
+
+
+def _channels(measured) -> tuple[int, int]:
+    """Return the numbers of records and of signals."""
+    return measured.shape[0], measured.shape[-1]
+
+
+def noise_outside(
+    residual: Float[np.ndarray, "record time signal"],
+    measured: Bool[np.ndarray, "record time signal"],
+    responses: Float[np.ndarray, "response record time signal"],
+) -> Noise:
+    """Return the noise that is left of a residual outside the space of some responses.
+
+    Args:
+        residual: in the outputs' units; anything where nothing is measured.
+        measured: where there is a sample.
+        responses: of all that may have acted: the model's sensitivities, the candidates' responses.
+
+    """
+    records, signals = _channels(measured)
+    # An output that a record does not hold has no noise there.
+    channels = [(k, i) for k, i in np.ndindex(records, signals) if measured[k, :, i].any()]
+    deviation = np.ones((records, 1, signals))
+    for k, i in channels:
+        deviation[k, 0, i] = _deviation(residual[k, :, i][measured[k, :, i]])
+    standardised = np.where(measured, residual, 0.0) / deviation
+
+    def of(series, channel):
+        k, i = channel
+        return series[k : k + 1, ..., i]
+
+    directions = _basis(np.where(measured, responses, 0.0) / deviation)
+    basis = {c: of(directions, c).copy() for c in channels}
+    coefficients = np.sum([np.tensordot(of(standardised, c), basis[c], 2) for c in channels], axis=0)
+    left = {c: of(standardised, c) - basis[c] @ coefficients for c in channels}
+    # Directions that were taken of each output, a share of one where it is in several.
+    taken = {c: float(np.vdot(basis[c], basis[c])) for c in channels}
+    noises = {
+        c: _white(float(np.sum(left[c] ** 2)) / max(float(of(measured, c).sum()) - taken[c], 1.0)) for c in channels
+    }
+    # What the projection took of the noise depends on the noise, first taken to be white: a few rounds settle it.
+    for _ in range(4):
+        inside = np.sum([meat(basis[c], noise) for c, noise in noises.items()], axis=0)
+        absorbed = {c: absorbed_by_the_fit(basis[c], of(measured, c), noise, inside) for c, noise in noises.items()}
+        noises = {c: residual_noise(left[c], of(measured, c), "auto", absorbed[c], taken[c]) for c in channels}
+        if not any(len(noise.coefficients) for noise in noises.values()):
+            break
+
+    def in_units(k, i):
+        noise, square = noises.get((k, i), _white(1.0)), deviation[k, 0, i] ** 2
+        return noise._replace(
+            variance=noise.variance * square, innovation_variance=noise.innovation_variance * square
+        )  # fmt: skip
+
+    return Noise(tuple(tuple(in_units(k, i) for i in range(signals)) for k in range(records)), measured)
+
+
+def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
+    """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples."""
+    shape = responses.shape[1:]
+    flat = responses.reshape(len(responses), -1)
+    norms = np.linalg.norm(flat, axis=1)
+    flat = flat[norms > 0] / norms[norms > 0, None]
+    # There are many more samples than responses: their products are quicker decomposed.
+    squares, combinations = np.linalg.eigh(flat @ flat.T)
+    order = np.argsort(-squares)[: flat.shape[1] // 2]
+    kept = order[squares[order] > _NEGLIGIBLE**2 * squares[-1]]
+    vectors = (combinations[:, kept] / np.sqrt(squares[kept])).T @ flat
+    return np.moveaxis(vectors.reshape(-1, *shape), 0, 2)
+
+
+def _deviation(values) -> float:
+    found = float(np.std(values)) if len(values) else 1.0
+    return found if found > 0 else 1.0

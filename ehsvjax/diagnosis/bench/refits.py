@@ -1,0 +1,230 @@
+"""Refits: from many starts at once, each with unknowns of its own, by Levenberg-Marquardt on scaled residuals."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
+from ehsvjax.effects.effect import UNLIMITED
+
+_ITERATIONS = 60
+# A start is given up if so many steps like the next would not bring it to the best, after a few.
+_HOPELESS = 5.0
+_PATIENCE = 4
+_STEEPEST = 1e100
+# Share of a step at which its curvature is taken, and of the step that its acceleration may be.
+_AHEAD, _MOST_BENT = 0.1, 0.75
+
+
+class Refits(NamedTuple):
+    """Where each start has led.
+
+    Attributes:
+        points: `[individual, parameter]` the best point of each.
+        cost: the sum of squares of its scaled residuals.
+        residual: measured minus simulated there, in the outputs' units.
+        slopes: derivatives of the outputs by the chosen unknowns there; zero along padding.
+        chosen: `[individual, direction]` the unknowns' columns; -1 is padding.
+        converged: whether another step would gain less than a hundredth of the residuals' variance.
+
+    """
+
+    points: Float[np.ndarray, "individual parameter"]
+    cost: Float[np.ndarray, " individual"]
+    residual: Float[np.ndarray, "individual record time signal"]
+    slopes: Float[np.ndarray, "individual direction record time signal"]
+    chosen: Int[np.ndarray, "individual direction"]
+    converged: Bool[np.ndarray, " individual"]
+
+    def of(self, some: Sequence[int]) -> "Refits":
+        """Return the refits of some starts."""
+        return Refits(*(field[list(some)] for field in self))
+
+
+def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
+    """Return an orthonormal basis of what the unknowns can do to first order."""
+    norms = np.linalg.norm(slopes, axis=1)
+    kept = slopes[norms > 0] / norms[norms > 0, None]
+    if not len(kept):
+        return np.zeros((slopes.shape[1], 0))
+    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
+    return vectors[:, values > TOLD_APART * values[0]]
+
+
+def unexplained(
+    final: Refits, weigh: Callable[[np.ndarray], np.ndarray]
+) -> tuple[Float[np.ndarray, "sample independent"], Float[np.ndarray, " sample"]]:
+    """Return what the unknowns of a refit can do to first order, and its residual outside of that, both weighed.
+
+    Args:
+        final: one refit.
+        weigh: `Noise.scaled`, or `Noise.innovations`.
+
+    """
+    known = span(weigh(final.slopes[0]))
+    residual = weigh(final.residual[0])
+    return known, residual - known @ (known.T @ residual)
+
+
+def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
+    """Return lists of columns side by side, filled up with -1."""
+    return np.array([list(c) + [-1] * (width - len(c)) for c in columns])
+
+
+def bounds_of(bench: Workbench) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " parameter"]]:
+    """Return the least and the largest coordinate of every unknown."""
+    lower, upper = np.zeros(len(bench.nominal)), np.ones(len(bench.nominal))
+    for candidate in bench.candidates:
+        scales = bench.scales[candidate.name]
+        for number, j in bench.unknowns_of(candidate):
+            unit = bench.problem.coordinates.upper[j]
+            low, high = number.lower(scales), number.upper(scales)
+            lower[j] = -np.inf if low <= -UNLIMITED else low / unit
+            upper[j] = np.inf if high >= UNLIMITED else high / unit
+    return lower, upper
+
+
+def refit(
+    bench: Workbench,
+    starts: Float[np.ndarray, "individual parameter"],
+    chosen: Int[np.ndarray, "individual direction"],
+    noise: Noise,
+    iterations: int = _ITERATIONS,
+    race: bool = True,
+) -> Refits:
+    """Refit the chosen unknowns of every start.
+
+    Damping is relative to the diagonal and grows by 2, 4, 8, ... for steps in a row that did not lower the cost
+    (Nielsen 1999); an unknown at a bound that the gradient pushes outwards is held there. Steps bend with the valley
+    that they follow (geodesic acceleration, Transtrum & Sethna 2012, arXiv 1201.5885), which takes one more simulation.
+
+    Args:
+        bench: the trials' workbench.
+        starts: points.
+        chosen: columns of the unknowns of each start; -1 is padding.
+        noise: of the noise.
+        iterations: at most this many steps.
+        race: whether the starts compete: what is far behind the best is given up.
+
+    """
+    lower, upper = bounds_of(bench)
+    readings = bench.problem.samples.outputs
+    count, width = chosen.shape
+    points = starts.copy()
+    kept: list[_Here | None] = [None] * count
+    damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
+    cost = np.full(count, np.inf)
+    converged = np.zeros(count, bool)
+    running = np.ones(count, bool)
+    for k in range(count):
+        own = chosen[k][chosen[k] >= 0]
+        points[k, own] = np.clip(points[k, own], lower[own], upper[own])
+    trial = points.copy()
+    for iteration in range(iterations):
+        at = np.flatnonzero(running)
+        if not len(at):
+            break
+        y, slopes = bench.linearised(trial[at], chosen[at])
+        residual = readings[None] - y
+        scaled = noise.scaled(residual)
+        columns = noise.scaled(slopes)
+        for row, i in enumerate(at):
+            value = float(scaled[row] @ scaled[row])
+            jacobian = columns[:, row]
+            # A NaN is no improvement, nor is a place that is so steep that nothing can be told from there.
+            if value < cost[i] and np.max(np.abs(jacobian), initial=0.0) < _STEEPEST:
+                points[i], cost[i] = trial[i], value
+                kept[i] = _Here(residual[row], slopes[:, row], jacobian, jacobian @ scaled[row], jacobian @ jacobian.T)
+                damping[i], growth[i] = 0.1 * damping[i], 2.0
+            else:
+                damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
+            here = kept[i]
+            if here is None:
+                running[i] = False
+                continue
+            step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
+            if gain < 0.01 * max(cost[i] / scaled.shape[1], 1e-300):
+                converged[i] = True
+                running[i] = False
+            elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
+                running[i] = False
+            trial[i] = points[i] + step
+        _bend(bench, noise, trial, np.flatnonzero(running), points, chosen, kept, damping, lower, upper)
+    shape = bench.problem.samples.outputs.shape
+    nothing = (np.full(shape, np.nan), np.zeros((width, *shape)))
+    return Refits(
+        points,
+        cost,
+        np.stack([k.residual if k else nothing[0] for k in kept]),
+        np.stack([k.slopes if k else nothing[1] for k in kept]),
+        chosen,
+        converged,
+    )
+
+
+class _Here(NamedTuple):
+    """What is known at the best point of a start; from the jacobian on scaled."""
+
+    residual: Float[np.ndarray, "record time signal"]
+    slopes: Float[np.ndarray, "direction record time signal"]
+    jacobian: Float[np.ndarray, "direction sample"]
+    gradient: Float[np.ndarray, " direction"]
+    information: Float[np.ndarray, "direction direction"]
+
+
+def _bend(bench, noise, trial, running, points, chosen, kept, damping, lower, upper) -> None:
+    """Add to steps half the acceleration that keeps them in their valley, where it is less than the step itself."""
+    if not len(running):
+        return
+    steps = trial[running] - points[running]
+    ahead = bench.simulated(points[running] + _AHEAD * steps)
+    for row, i in enumerate(running):
+        here, own = kept[i], np.maximum(chosen[i], 0)
+        assert here is not None
+        along = np.where(chosen[i] >= 0, steps[row][own], 0.0)
+        changed = noise.scaled(ahead[row] - (bench.problem.samples.outputs - here.residual))
+        curvature = 2.0 / _AHEAD * (changed / _AHEAD - along @ here.jacobian)
+        if not np.isfinite(curvature).all():
+            continue
+        gradient = -(here.jacobian @ curvature)
+        bent, _ = _step(points[i], chosen[i], gradient, here.information, damping[i], lower, upper)
+        size = np.sqrt(np.diag(here.information))
+        if 2.0 * np.linalg.norm(size * bent[own]) <= _MOST_BENT * np.linalg.norm(size * along):
+            moved = trial[i, own] + 0.5 * np.where(chosen[i] >= 0, bent[own], 0.0)
+            trial[i, own] = np.clip(moved, lower[own], upper[own])
+
+
+def _step(point, chosen, gradient, information, damping, lower, upper):
+    """Return the step of one point in all its coordinates, and what it should gain to first order.
+
+    Unknowns that would pass a bound go as far as that, and the others take the best step beside it (active set).
+    """
+    columns = np.maximum(chosen, 0)
+    room = np.stack([lower[columns], upper[columns]]) - point[columns]
+    pushed_out = ((room[1] <= 0) & (gradient > 0)) | ((room[0] >= 0) & (gradient < 0))
+    free = (chosen >= 0) & (np.diag(information) > 0) & ~pushed_out
+    moved, able = np.zeros(len(chosen)), free.copy()
+    while able.any():
+        moved[able] = _damped(
+            information[np.ix_(able, able)], (gradient - information @ np.where(able, 0.0, moved))[able], damping
+        )
+        passing = able & ((moved < room[0]) | (moved > room[1]))
+        if not passing.any():
+            break
+        moved[passing] = np.clip(moved, *room)[passing]
+        able &= ~passing
+    step = np.zeros(len(point))
+    step[chosen[free]] = moved[free]
+    return step, float(gradient[free] @ moved[free])
+
+
+def _damped(information, gradient, damping):
+    """Return the damped Gauss-Newton step of unknowns that are free to move."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    values, vectors = np.linalg.eigh(information * scale[:, None] * scale)
+    fixed = values > TOLD_APART**2 * values[-1]
+    inverse = np.where(fixed, 1.0 / (np.where(fixed, values, 1.0) + damping), 0.0)
+    return scale * (vectors @ (inverse * (vectors.T @ (scale * gradient))))

@@ -1,0 +1,166 @@
+"""What the causes that were found leave: is it innocent, is it chance, does the bank lack what is missing?"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
+from ehsvjax.diagnosis.bench.significance import INSEPARABLE
+from ehsvjax.diagnosis.decision.search import SIGNIFICANT, Selection
+from ehsvjax.diagnosis.hypotheses.curves import Terms, terms_at
+from ehsvjax.diagnosis.hypotheses.dependence import Dependence, dependences
+from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term
+from ehsvjax.diagnosis.hypotheses.process_noise import CONVINCING, ProcessNoise, process_noise
+
+# Dependences that are followed up where something is left.
+_SUSPECTS = 8
+
+
+class Examination(NamedTuple):
+    """What is left of the residual, and of the causes.
+
+    Attributes:
+        selection: with the noise of what is left; without causes if chance, a random force, explains more.
+        before: what the nominal model's residual depends on, the most significant first.
+        after: what the extended model's residual depends on.
+        innocent: whether that is nothing.
+        chance: the random force that explains the nominal model's residual better than any cause; None if none does.
+        or_chance: whether a random force explains it about as well as all causes together.
+        instead: one term of free form that explains the record as well as all causes together, but for the price of
+            its pieces; looked for beside several, or where they leave something; None if none does.
+        lacking: whether that term explains more, its price paid: the bank lacks what is missing.
+
+    """
+
+    selection: Selection
+    before: tuple[Dependence, ...]
+    after: tuple[Dependence, ...]
+    innocent: bool
+    chance: ProcessNoise | None
+    or_chance: bool
+    instead: MissingTerm | None
+    lacking: bool
+
+
+def examine(selection: Selection) -> Examination:
+    """Test what a selection leaves, and whether something else explains the record better."""
+    bench = selection.bench
+    noise, terms = selection.noise, selection.trials.terms
+    before = dependences(selection.nominal, noise, terms)
+    after = before
+    if selection.included:
+        terms = terms_at(bench, selection.final.points[0], selection.seen)
+        after = dependences(selection.final, noise, terms)
+    innocent = not _depends(selection, after, terms)
+    chance, or_chance = _random_force(selection, before, innocent)
+    if chance is not None:
+        selection, after, innocent = selection.without_causes(), before, True
+    if innocent:
+        selection = replace(selection, noise=_own_noise(selection))
+    return Examination(selection, before, after, innocent, chance, or_chance, *_instead(selection, before, innocent))
+
+
+def remaining_term(examined: Examination) -> MissingTerm | None:
+    """Return what is missing beside the causes that were found, or could be in the place of them all."""
+    if examined.innocent or examined.lacking:
+        return examined.instead
+    selection = examined.selection
+    return missing_term(
+        selection.bench, selection.final, selection.noise, selection.seen, _suspects(examined.after)
+    )  # fmt: skip
+
+
+def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
+    """Return the dependences that are followed up: the most significant, and those of a place on itself."""
+    at_home = (t for t in tests[_SUSPECTS:] if t.place == t.quantity and t.corrected < SIGNIFICANT)
+    return (*tests[:_SUSPECTS], *at_home)
+
+
+def _depends(selection: Selection, tests: tuple[Dependence, ...], terms: Terms) -> bool:
+    """Whether what is left depends on something, also if it is itself taken for coloured noise."""
+    # Where nothing that a term could do would show, nothing can be told from noise.
+    if not tests or tests[0].corrected >= SIGNIFICANT:
+        return False
+    own = _own_noise(selection)
+    if not own.coloured:
+        return True
+    again = dependences(selection.final, own, terms)
+    return bool(again) and again[0].corrected < SIGNIFICANT
+
+
+def _own_noise(selection: Selection) -> Noise:
+    """Return the noise if all that is left is noise."""
+    final = selection.final
+    return noise_outside(final.residual[0], selection.bench.problem.samples.measured, final.slopes[0])
+
+
+def _random_force(
+    selection: Selection, before: tuple[Dependence, ...], innocent: bool
+) -> tuple[ProcessNoise | None, bool]:
+    """Return the random force that explains the nominal model's residual better than any cause, if there is one.
+
+    What the causes seemed to explain was then the motion that the force had left behind. And whether a random force
+    explains it about as well as they do.
+    """
+    bench = selection.bench
+    nominal = process_noise(bench, selection.nominal, selection.noise)
+    if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
+        return None, False
+    if selection.included:
+        final = process_noise(bench, selection.final, selection.noise)
+        # Where no force shows any more, the causes have made it invisible.
+        better = -np.inf if final is None else nominal.likelihood - final.of_sensor + _least_price(selection)
+        # A single cause that leaves nothing unexplained has the first word.
+        single = innocent and len(selection.included) == 1
+        if not better > (CONVINCING if single else INSEPARABLE):
+            return None, bool(better > -INSEPARABLE)
+    if before and before[0].corrected < SIGNIFICANT:
+        # A term that depends on what runs along the model is a better reason than chance.
+        term = missing_term(bench, selection.nominal, selection.noise, selection.seen, _suspects(before))
+        if _likelihood(selection.noise, term) > nominal.likelihood:
+            return None, False
+    return nominal, False
+
+
+def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
+    """Return a term of free form that explains the record as well as all causes together, and whether better."""
+    causes = selection.included
+    if not before or not causes or (innocent and len(causes) == 1):
+        return None, False
+    noise = selection.noise
+    term = missing_term(selection.bench, selection.nominal, noise, selection.seen, _suspects(before))
+    price = float(np.log(noise.measured.sum()))
+    better = noise.gained(selection.final.residual[0], term.residual)
+    better += price * sum(_numbers(selection, i) for i in causes)
+    return (term if better > -INSEPARABLE else None), bool(better > price * term.pieces)
+
+
+def _likelihood(noise: Noise, term: MissingTerm) -> float:
+    """Return twice the logarithm of the likelihood of what a term leaves, less Bayes' price for its pieces."""
+    r = noise.innovations(term.residual)
+    return -noise.log_units - float(len(r) * (np.log(r @ r / len(r)) + 1.0) + term.pieces * np.log(len(r)))
+
+
+def _least_price(selection: Selection) -> float:
+    """Return Bayes' price for all causes but that of one number, each in the shape of its cheapest rival.
+
+    What a rival fits worse counts as part of its price: two numbers that explain as much as one are no better.
+    """
+    per_number = float(np.log(selection.bench.problem.samples.measured.sum()))
+    cheapest = [
+        min(float(r.refitted.cost[0] - selection.final.cost[0]) + per_number * _numbers(selection, r.candidate)
+            for r in group if r.deficit < INSEPARABLE)
+        for group in selection.rivals
+    ]  # fmt: skip
+    return sum(cheapest) - per_number
+
+
+def _numbers(selection: Selection, candidate: int) -> int:
+    """Return the numbers of a cause for Bayes' price; a frequency counts for three, as a record fixes it so sharply.
+
+    Its information grows with the third power of the record's length (Djuric 1996, "A model selection rule for
+    sinusoids in white Gaussian noise").
+    """
+    bench = selection.bench
+    return bench.numbers_of(candidate) + 2 * bench.candidates[candidate].effect.harmonic

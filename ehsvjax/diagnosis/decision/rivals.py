@@ -1,0 +1,174 @@
+"""What could be there instead of an effect that was found: its rivals, refitted in its place."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
+from ehsvjax.diagnosis.bench.significance import INSEPARABLE
+from ehsvjax.diagnosis.bench.workbench import Workbench
+from ehsvjax.diagnosis.decision.trials import (
+    REFITTED_TOGETHER,
+    Trials,
+    fits,
+    refit_screened,
+    refit_set,
+    refit_sets,
+    without,
+)
+from ehsvjax.diagnosis.hypotheses.screening import Screened, responses_at, screen
+
+PER_NUMBER = 4.0
+"""Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
+_SWAPS = 3
+# Noise variances by which a refit has to be better than another to take its place.
+_LOWER = 0.1
+# Deficit to first order of a rival that is refitted, however many there are; a large effect is not of first order.
+_WORTH_A_REFIT = 100.0
+
+
+def price(bench: Workbench, candidate: int, point: Float[np.ndarray, " parameter"]) -> float:
+    """Return the noise variances that a candidate must bring beyond another to come before it: numbers and rarity.
+
+    A constant that was given wrong, the commonest cause of all, may be off by any factor; a sensor hardly by a third.
+    """
+    unknowns = bench.unknowns_of(bench.candidates[candidate])
+    rarest = max(number.rarity(bench.value(point, j)) for number, j in unknowns if number.absent is not None)
+    return PER_NUMBER * (bench.numbers_of(candidate) + rarest)
+
+
+class Rival(NamedTuple):
+    """A refit of one candidate in the place of another: how much worse than the best, as `Noise.gained` counts."""
+
+    candidate: int
+    deficit: float
+    refitted: Refits
+
+
+def inseparable(group: Sequence[Rival]) -> tuple[Rival, ...]:
+    """Return those of an effect's rivals that a record cannot tell from the best."""
+    return tuple(rival for rival in group if rival.deficit < INSEPARABLE)
+
+
+def rivals_of_all(
+    trials: Trials, included: tuple[int, ...], final: Refits, noise: Noise
+) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
+    """Return the effects after swaps for better rivals, their refit, and for each all that could be there instead."""
+    groups: dict[int, tuple[Rival, ...]] = {}
+    swaps, waiting = 0, list(included)
+    while waiting:
+        own = waiting.pop(0)
+        group = _rivals_of(trials, own, tuple(j for j in included if j != own), final, noise)
+        best = group[0]
+        if swaps < _SWAPS and (best.candidate != own or _cost(best.refitted) < _cost(final) - _LOWER):
+            # The others are looked at anew, beside what is better.
+            swaps += 1
+            included, final = tuple(best.candidate if j == own else j for j in included), best.refitted
+            waiting = [j for j in included if j != best.candidate]
+            own = best.candidate
+        groups[own] = group
+    return included, final, tuple(groups[i] for i in included)
+
+
+def rivals_again(
+    trials: Trials, included: tuple[int, ...], final: Refits, groups: Sequence[Sequence[Rival]], noise: Noise
+) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
+    """Return the same as `rivals_of_all` from where all have been refitted, under another step or noise."""
+    ranked = []
+    for own, group in zip(included, groups, strict=True):
+        rest = tuple(j for j in included if j != own)
+        # Beside what has been swapped in for another cause, some have too many numbers.
+        able = [r for r in group if r.candidate != own and fits(trials.bench, (*rest, r.candidate))]
+        starts, others = [[r.refitted.points[0]] for r in able], [r.candidate for r in able]
+        led = refit_sets(trials, starts, [(*rest, i) for i in others], noise, race=True) if others else None
+        found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
+        ranked.append(_ranked(trials, own, {own: final} | found, noise))
+    for own, group in zip(included, ranked, strict=True):
+        if group[0].candidate != own:
+            included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
+            break
+    return included, final, tuple(ranked)
+
+
+def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, noise: Noise) -> tuple[Rival, ...]:
+    """Return what was refitted in the place of one effect, the best first."""
+    bench = trials.bench
+    start = without(bench, final.points[0], own)
+    current = refit_set(trials, start, rest, noise)
+    base = _beside(trials, start, current, noise) if rest else current
+    # From where the model is without the cause, and from where it is with it: a rival may do just the same.
+    found = _refitted_from(trials, base, own, rest, noise, start)
+    return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
+
+
+def _ranked(trials: Trials, own: int, found: Mapping[int, Refits], noise: Noise) -> tuple[Rival, ...]:
+    """Return what was refitted in the place of an effect, the best first, with how much worse each is."""
+    able = {candidate: refitted for candidate, refitted in found.items() if np.isfinite(_cost(refitted))}
+    prices = {candidate: price(trials.bench, candidate, refitted.points[0]) for candidate, refitted in able.items()}
+
+    def behind(best: int) -> dict[int, float]:
+        """Return by how much each is worse than one of them, their prices included."""
+        return {
+            candidate: noise.gained(refitted.residual[0], able[best].residual[0]) + prices[candidate] - prices[best]
+            for candidate, refitted in able.items()
+        }
+
+    lowest = behind(min(able, key=lambda candidate: _cost(able[candidate])))
+    best = min(lowest, key=lambda candidate: lowest[candidate])
+    # As good but for rounding: no reason to swap.
+    best = own if lowest[own] < lowest[best] + 1e-3 else best
+    ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))
+    return tuple(Rival(candidate, max(0.0, deficit), able[candidate]) for candidate, deficit in ranked)
+
+
+def _cost(refitted: Refits) -> float:
+    return float(refitted.cost[0])
+
+
+def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Refits, noise: Noise) -> Refits:
+    """Return the point where the model's own unknowns are refitted, and other effects stay as they are with the cause.
+
+    Once these have gone to make up for what is not there, they do not always find back: a frequency for one.
+    """
+    bench = trials.bench
+    own = bench.base_columns
+    # The model's unknowns from where they are with the cause, and from where they are without it.
+    starts = np.stack([start, start])
+    starts[1, own] = current.points[0, own]
+    held = refit(bench, starts, padded([own] * 2, current.chosen.shape[1]), noise)
+    return refit(bench, held.points[np.argmin(held.cost)][None], current.chosen, noise, iterations=1)
+
+
+def _refitted_from(
+    trials: Trials, base: Refits, own: int, rest: tuple[int, ...], noise: Noise, with_it: np.ndarray
+) -> dict[int, Refits]:
+    """Return the refits of candidates that are, at a point without the effect, most like it.
+
+    Also from where all else is as it is with it.
+    """
+    bench = trials.bench
+    screening = screen(bench, base, responses_at(bench, base, rest, noise, trials.parts), noise, 1)
+    close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
+    if not close:
+        return {}
+    refitted = refit_screened(trials, close, rest, noise, base, [with_it])
+    return {s.candidate: refitted.of([k]) for k, s in enumerate(close)}
+
+
+def _close(ranked: Sequence[Screened], own: int) -> list[Screened]:
+    """Return the candidates whose response is most like that of one effect, itself among them."""
+    mine = next((s for s in ranked if s.candidate == own), None)
+    if mine is None:
+        return list(ranked[:REFITTED_TOGETHER])
+    alike = sorted(ranked, key=lambda s: -abs(float(s.response @ mine.response)))
+    strongest = [s for s in ranked[: REFITTED_TOGETHER // 2] if s.candidate != own]
+    chosen = {s.candidate: s for s in [mine, *strongest]}
+    for s in alike:
+        # What a rival's refit could at most reach, to first order.
+        deficit = mine.score**2 * (1.0 - float(s.response @ mine.response) ** 2)
+        if len(chosen) < REFITTED_TOGETHER or (deficit < _WORTH_A_REFIT and len(chosen) < 2 * REFITTED_TOGETHER):
+            chosen.setdefault(s.candidate, s)
+    return list(chosen.values())

@@ -1,0 +1,346 @@
+"""The search for causes: add the one that explains most, refit, look again; then its rivals, swaps and deletions."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.arithmetic import finest
+from ehsvjax.diagnosis.bench.jumps import without_jumps
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
+from ehsvjax.diagnosis.bench.progress import Progress
+from ehsvjax.diagnosis.bench.refits import Refits
+from ehsvjax.diagnosis.bench.significance import INSEPARABLE
+from ehsvjax.diagnosis.bench.workbench import Workbench, prepared, settled
+from ehsvjax.diagnosis.decision.prediction import predicted
+from ehsvjax.diagnosis.decision.rivals import PER_NUMBER, Rival, price, rivals_again, rivals_of_all
+from ehsvjax.diagnosis.decision.trials import (
+    REFITTED_TOGETHER,
+    Trials,
+    fits,
+    refit_reshaped,
+    refit_screened,
+    refit_set,
+    trials_of,
+    without,
+)
+from ehsvjax.diagnosis.hypotheses.screening import Screening, responses_at, screen
+
+SIGNIFICANT = 0.002
+"""Corrected p-value of the whole search below which an effect is taken to be there."""
+_MOST_EFFECTS = 3
+# Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
+_ROUNDS = 6
+# Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
+_WEIGHED = 25.0
+
+
+class Stage(NamedTuple):
+    """One look at what is left: the refit that it started from, the noise, and the candidates' scores.
+
+    Its trials have the step that arithmetic needs there, and the readings that it knows.
+    """
+
+    trials: Trials
+    included: tuple[int, ...]
+    current: Refits
+    noise: Noise
+    screening: Screening
+
+
+class Integration(NamedTuple):
+    """How a diagnosis was simulated.
+
+    Attributes:
+        step_size: s.
+        left_out: output -> readings beside a jump, which no such step knows or no unknown places: they carry no weight.
+        worth: noise variances by which halving the step changes the difference of any two explanations' sums of
+            squares, at most; of what is more than 25 behind, in twenty-fifths of that.
+
+    """
+
+    step_size: float
+    left_out: dict[str, int]
+    worth: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What the search came to.
+
+    Attributes:
+        trials: what was tried, with, on their workbench, the samples that were used.
+        included: positions of the effects, in the order in which they were found.
+        final: the refit with them.
+        nominal: the refit without any, under the same noise.
+        noise: the noise of what is left.
+        stages: the looks, the first at the nominal model.
+        rivals: for each included effect all that were refitted in its place, the best, itself, first.
+        gains: for each included effect how much worse the fit is without it, as `Noise.gained` counts.
+        integration: how all was simulated.
+
+    """
+
+    trials: Trials
+    included: tuple[int, ...]
+    final: Refits
+    nominal: Refits
+    noise: Noise
+    stages: tuple[Stage, ...]
+    rivals: tuple[tuple[Rival, ...], ...]
+    gains: tuple[float, ...]
+    integration: Integration
+
+    @property
+    def bench(self) -> Workbench:
+        """The workbench."""
+        return self.trials.bench
+
+    @property
+    def seen(self) -> dict[str, Float[np.ndarray, "record time"]]:
+        """What runs along the nominal model and varies, by name."""
+        return self.trials.seen
+
+    def without_causes(self) -> "Selection":
+        """Return it with the nominal model alone."""
+        return replace(self, included=(), final=self.nominal, rivals=(), gains=())
+
+
+def select(bench: Workbench, progress: Progress) -> Selection:
+    """Search for the causes of what a fit leaves of a record.
+
+    Args:
+        bench: the fit and the record.
+        progress: told of each stage.
+
+    """
+    begun, bench = bench, prepared(bench)
+    progress("simulating every candidate", 0.15)
+    trials = trials_of(bench, progress)
+    plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
+    stages = [_look(trials, (), refit_set(trials, bench.nominal, (), plain), plain)]
+    while len(stages[-1].included) < _MOST_EFFECTS:
+        found = _next_effect(stages[-1])
+        if found is None:
+            break
+        stages.append(found)
+    progress("refitting the rivals", 0.5)
+    last = stages.pop()
+    nominal = stages[0].current if stages else last.current
+    weighed = _weighed(last, nominal)
+    while weighed.needless is not None:
+        # What was added first can become needless by what was added later.
+        last = weighed.stage
+        start = without(last.trials.bench, last.current.points[0], weighed.needless)
+        rest = tuple(j for j in last.included if j != weighed.needless)
+        refitted = refit_set(last.trials, start, rest, last.noise)
+        weighed = _weighed(_look(last.trials, rest, refitted, last.noise), nominal)
+    last = weighed.stage
+    return Selection(
+        trials=last.trials,
+        included=last.included,
+        final=last.current,
+        nominal=weighed.nominal,
+        noise=last.noise,
+        stages=(*stages, last),
+        rivals=weighed.rivals,
+        gains=weighed.gains,
+        integration=_integration(begun, last.trials.bench, weighed.worth),
+    )
+
+
+class _Weighed(NamedTuple):
+    """The causes of a stage, each in the best form of its rivals, and all that they are compared with.
+
+    Attributes:
+        stage: with the causes after swaps for better rivals, at the step that all that is compared needs.
+        nominal: the refit without any, under the same noise.
+        rivals: for each cause all that was refitted in its place, the best first.
+        gains: for each cause how much worse the fit is without it, as `Noise.gained` counts.
+        needless: the cause that is needed least, if the record can do without it.
+        worth: noise variances by which halving the step changes the difference of any two of them.
+
+    """
+
+    stage: Stage
+    nominal: Refits
+    rivals: tuple[tuple[Rival, ...], ...]
+    gains: tuple[float, ...]
+    needless: int | None
+    worth: float
+
+
+def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
+    """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
+    looked_at = set(stage.included)
+    included, final, rivals = rivals_of_all(stage.trials, stage.included, stage.current, stage.noise)
+    for rounds_left in reversed(range(_ROUNDS)):
+        stage = stage._replace(included=included, current=final)
+        trials, noise = stage.trials, stage.noise
+        nominal = refit_set(trials, nominal.points[0], (), noise)
+        known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), noise)
+        if not rounds_left or (known is trials.bench and set(included) == looked_at):
+            break
+        # Nothing is searched again: what was found is refitted from where it is, under the noise that is left now.
+        stage = _look(trials._replace(bench=known), included, final, noise)
+        looked_at = set(included)
+        included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
+    gains, needless = _gains(stage, nominal)
+    return _Weighed(stage, nominal, rivals, gains, needless, worth)
+
+
+def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
+    """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them.
+
+    The first is the best. Where another is far behind, its arithmetic counts as a part of that.
+    """
+    outputs_at = bench.stepped(points)
+    known = settled(bench, outputs_at, noise.innovation_variances)
+    here = int(known.problem.substeps)
+    coarse, fine = (
+        np.sum(noise.scaled(known.problem.samples.outputs - outputs_at(substeps)) ** 2, axis=-1)
+        for substeps in (here, 2 * here)
+    )
+    behind = np.maximum(1.0, (fine - fine[0]) / _WEIGHED)
+    worth = float(np.max(np.abs((fine - coarse) - (fine - coarse)[0]) / behind))
+    if known is bench and worth > 1.0 and not finest(known.problem):
+        return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
+    return known, worth
+
+
+def _integration(begun: Workbench, ended: Workbench, worth: float) -> Integration:
+    """Return how all was simulated, from the benches at the start and at the end."""
+    samples = ended.problem.samples
+    left_out = (begun.problem.samples.measured & ~samples.measured).sum(axis=(0, 1))
+    return Integration(
+        step_size=float(np.max(samples.sample_period)) / int(ended.problem.substeps),
+        left_out=dict(zip(ended.problem.observed, left_out.tolist(), strict=True)),
+        worth=worth,
+    )
+
+
+def _compared(final: Refits, nominal: Refits, rivals: Sequence[Sequence[Rival]]) -> Float[np.ndarray, "individual _"]:
+    """Return the points of all explanations that a verdict weighs against each other."""
+    close = [r.refitted.points for group in rivals for r in group if r.deficit < _WEIGHED]
+    return np.concatenate([final.points, nominal.points, *close])
+
+
+def required_gain(bench: Workbench, screening: Screening, candidate: int) -> float:
+    """Return the likelihood ratio that an effect must bring, in noise variances, for the search that found it."""
+    if bench.candidates[candidate].effect.harmonic:
+        frequencies = bench.problem.samples.measured.sum() / 2
+        return float(2.0 * np.log(frequencies / SIGNIFICANT)) + PER_NUMBER
+    return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
+
+
+def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> Stage:
+    """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest."""
+    trials, current = _known(trials, included, current, noise)
+    while True:
+        bench = trials.bench
+        measured = bench.problem.samples.measured
+        tried = responses_at(
+            bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.parts
+        )
+        spanned = np.concatenate([current.slopes[0], tried.changes, trials.terms.responses])
+        noise = noise_outside(current.residual[0], measured, spanned)
+        before = trials
+        trials, current = _known(before, included, current, noise)
+        if trials is before:
+            break
+    if noise.coloured or noise.variances.size > 1:
+        current = refit_set(trials, current.points[0], included, noise)
+        tried = responses_at(bench, current, included, noise, trials.parts)
+    else:
+        # The variance of one record's and output's white noise does not move the best fit.
+        current = current._replace(cost=np.array([_cost_under(current, noise)]))
+    return Stage(trials, included, current, noise, screen(bench, current, tried, noise, int(measured.sum()) // 2))
+
+
+def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> tuple[Trials, Refits]:
+    """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
+    while True:
+        bench = trials.bench
+        known = without_jumps(settled(bench, bench.stepped(current.points), noise.innovation_variances), current, noise)
+        if known is bench:
+            return trials, current
+        trials = trials._replace(bench=known)
+        only_known = plain_noise(noise.variances, known.problem.samples.measured)
+        current = refit_set(trials, current.points[0], included, only_known)
+
+
+def _next_effect(stage: Stage) -> Stage | None:
+    """Return the next look, with one effect more, or none if no effect is significant."""
+    trials = stage.trials
+    bench = trials.bench
+    hopeful = [
+        s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
+    ]
+    if not hopeful:
+        return None
+    best: Stage | None = None
+    # The best by score are not always the best once refitted: if something is left of them, others are tried.
+    for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
+        some = hopeful[first : first + REFITTED_TOGETHER]
+        names = ", ".join(dict.fromkeys(bench.candidates[s.candidate].name for s in some[:3]))
+        more = ", ..." if len(some) > 3 else ""
+        trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
+        refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
+        penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
+        enough = [
+            stage.noise.gained(stage.current.residual[0], residual) > required_gain(bench, stage.screening, s.candidate)
+            for s, residual in zip(some, refitted.residual, strict=True)
+        ]
+        if not any(enough):
+            continue
+        chosen = int(np.argmin(np.where(enough & np.isfinite(penalised), penalised, np.inf)))
+        if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.noise):
+            break
+        candidate = some[chosen].candidate
+        best = _look(trials, (*stage.included, candidate), refitted.of([chosen]), stage.noise)
+        if not _leaves_something(best):
+            break
+        reshaped = refit_reshaped(best.trials, best.current, best.included, candidate, best.noise)
+        if reshaped is not best.current:
+            best = _look(best.trials, best.included, reshaped, best.noise)
+            if not _leaves_something(best):
+                break
+    return best
+
+
+def _leaves_something(stage: Stage) -> bool:
+    """Whether a candidate is significant on what a stage leaves."""
+    left = stage.screening.ranked
+    return bool(left) and left[0].corrected < SIGNIFICANT
+
+
+def _cost_under(refits: Refits, noise: Noise) -> float:
+    return float(np.sum(noise.scaled(refits.residual[0]) ** 2))
+
+
+def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None]:
+    """Return how much worse the fit is without each effect, and the one that is needed least, if it is needless.
+
+    It is if it gains less than chance could, or if data that were not used are predicted better without it by more
+    than chance.
+    """
+    trials, final, noise = stage.trials, stage.current, stage.noise
+    if not stage.included:
+        return (), None
+    sets, points, gains = [stage.included], [final.points[0]], []
+    for i in stage.included:
+        rest = tuple(j for j in stage.included if j != i)
+        start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
+        refitted = refit_set(trials, start, rest, noise)
+        sets.append(rest)
+        points.append(refitted.points[0])
+        gains.append(noise.gained(refitted.residual[0], final.residual[0]))
+    unused = predicted(trials.bench, sets, np.stack(points), noise)
+    spare = {}
+    for i, gain, rest_predicts in zip(stage.included, gains, unused.residual[1:], strict=True):
+        contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
+        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - contradicted)
+    least = min(spare, key=lambda i: spare[i])
+    return tuple(gains), least if spare[least] < 0.0 else None

@@ -1,0 +1,139 @@
+"""The frequencies at which harmonic effects are tried: those at which they would explain most of a residual.
+
+What an effect does at some frequency is the sum of what it does in short parts of the record, which need to be
+simulated once only. Frequencies too high for the parts are looked for in the residual itself.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.parts import Parts, parts_at
+from ehsvjax.diagnosis.bench.refits import Refits, unexplained
+from ehsvjax.diagnosis.bench.workbench import Workbench, duration_of
+from ehsvjax.effects.effect import Candidate, Scales
+
+# Frequencies of each effect that are tried.
+_TRIED = 3
+# Two frequencies differ if they drift apart by this many periods along the record; the search looks closer.
+_APART, _CLOSE = 2.0, 0.2
+# Periods of the highest frequency whose share over a part is known well enough.
+_PERIODS_PER_PART = 0.35
+
+
+def parts_of(bench: Workbench) -> dict[str, Parts]:
+    """Return the responses to parts of a disturbance at every signal that a harmonic effect could disturb."""
+    places = dict.fromkeys(c.signal for c in bench.candidates if _by_parts(bench, c))
+    return {place: parts_at(bench, bench.nominal, place) for place in places}
+
+
+def with_frequencies(bench: Workbench, current: Refits, noise: Noise, parts: Mapping[str, Parts]) -> Workbench:
+    """Return the bench with the frequencies at which each harmonic effect is to be tried."""
+    duration = duration_of(bench.records)
+    known, r = unexplained(current, noise.innovations)
+    scales: dict[str, Scales] = {}
+    for candidate in bench.candidates:
+        if not candidate.effect.harmonic:
+            continue
+        own = bench.scales[candidate.name]
+        (frequency,) = (p for p in candidate.effect.parameters if p.name == "frequency")
+        lowest, highest = frequency.lower(own), frequency.upper(own)
+        peaks: list[tuple[float, float]] = []
+        if _by_parts(bench, candidate):
+            there = parts[candidate.signal]
+            edge = min(highest, 2.0 * np.pi * _PERIODS_PER_PART / there.length)
+            frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration)
+            peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, noise, known, r, there))
+            lowest = edge
+        # A record that does not hold the first output says nothing of it.
+        for k in np.flatnonzero(bench.problem.samples.measured[..., 0].any(axis=1)).tolist():
+            peaks += _peaks(*_periodogram(bench, current, k, lowest, highest))
+        scales[candidate.name] = {**own, "frequencies": _strongest(peaks, duration) or own["frequencies"]}
+    return replace(bench, scales={**bench.scales, **scales})
+
+
+def _by_parts(bench: Workbench, candidate: Candidate) -> bool:
+    """Whether what a harmonic effect does is the sum of what it does in parts of the record."""
+    return candidate.effect.harmonic and candidate.signal in bench.places and not candidate.effect.memory
+
+
+def _explained(
+    bench: Workbench, candidate: Candidate, frequencies, noise: Noise, known, r, parts: Parts
+) -> Float[np.ndarray, " frequency"]:
+    """Return the noise variances of the residual that an effect would take at each frequency, to first order."""
+    changes = noise.innovations(parts.responses)
+    changes = changes - (changes @ known) @ known.T
+    shares = _shares(bench, candidate, frequencies, parts)
+    along = shares @ (changes @ r)
+    information = np.einsum("fap,pq,fbq->fab", shares, changes @ changes.T, shares, optimize=True)
+    # An amplitude that does not show takes nothing.
+    return np.einsum("fa,fab,fb->f", along, np.linalg.pinv(information, rcond=1e-9, hermitian=True), along)
+
+
+def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
+    """Return what each of an effect's amplitudes adds to its signal in each part, `[frequency, amplitude, part]`."""
+    numbers = candidate.effect.parameters
+    scales = bench.scales[candidate.name]
+    amplitudes = [n for n in numbers if n.absent is not None]
+    absent = {n.name: n.absent if n.absent is not None else n.tries(scales)[0] for n in numbers}
+    internal = bench.internal
+    context = {**internal.contexts[candidate.signal], "time": bench.clock}
+    always = {"step_size": float(np.min(bench.problem.samples.sample_period)), "duration": scales["duration"]}
+
+    def added(own, value, along):
+        return candidate.effect.apply(own, value, along | always) - value
+
+    with jax.enable_x64(True):
+        every_time = jax.vmap(jax.vmap(added, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
+        every = jax.vmap(
+            every_time, in_axes=({n.name: 0 if n.name == "frequency" else None for n in numbers}, None, None)
+        )
+        rows = [
+            every(
+                {**absent, n.name: n.tries(scales)[0], "frequency": jnp.asarray(frequencies)},
+                jnp.asarray(internal.values[candidate.signal]),
+                {name: jnp.asarray(series) for name, series in context.items()},
+            )
+            for n in amplitudes
+        ]
+        means = [parts.means(np.asarray(row)) for row in rows]
+    # Each record has amplitudes of its own.
+    own = parts.of_record == np.arange(len(bench.records))[:, None]
+    return np.stack([mean * inside for mean in means for inside in own], axis=1)
+
+
+def _periodogram(bench: Workbench, current: Refits, record: int, lowest: float, highest: float):
+    """Return frequencies between two, rad/s, and how strong a record's residual of the first output is there."""
+    present = bench.present[record]
+    measured = bench.problem.samples.measured[record, present, 0]
+    residual = np.where(measured, current.residual[0, record, present, 0], 0.0)
+    size = 8 * len(residual)
+    power = np.abs(np.fft.rfft((residual - residual.mean()) * np.hanning(len(residual)), size)) ** 2
+    frequency = 2.0 * np.pi * np.fft.rfftfreq(size, float(bench.problem.samples.sample_period[record]))
+    inside = (frequency > lowest) & (frequency < highest)
+    # Of a sine in white noise this is the score of its two amplitudes.
+    deviation = np.sqrt(max(float(np.var(residual[measured])), 1e-300))
+    return frequency[inside], power[inside] / (0.1875 * len(residual) * deviation**2)
+
+
+def _peaks(frequencies, strength) -> list[tuple[float, float]]:
+    """Return the maxima of a strength, each with its frequency."""
+    padded = np.concatenate([[-np.inf], strength, [-np.inf]])
+    peak = (strength > padded[:-2]) & (strength >= padded[2:])
+    return list(zip(strength[peak].tolist(), frequencies[peak].tolist(), strict=True))
+
+
+def _strongest(peaks: Sequence[tuple[float, float]], duration: float) -> tuple[float, ...]:
+    """Return the frequencies of the strongest peaks that are apart: side lobes of a stronger one are no peaks."""
+    found: list[float] = []
+    for _, frequency in sorted(peaks, reverse=True):
+        if all(abs(frequency - other) > 2.0 * np.pi * _APART / duration for other in found):
+            found.append(frequency)
+        if len(found) == _TRIED:
+            break
+    return tuple(found)

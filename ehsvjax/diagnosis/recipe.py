@@ -1,0 +1,182 @@
+"""The recipe of a diagnosis on one screen: refit, screen, search, judge, extend, measure the gain."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Key
+
+from ehsvjax.checks import flag
+from ehsvjax.diagnosis.bench.progress import Progress
+from ehsvjax.diagnosis.bench.progress import bar as progress_bar
+from ehsvjax.diagnosis.bench.readings import spikes
+from ehsvjax.diagnosis.bench.workbench import Workbench, workbench
+from ehsvjax.diagnosis.decision.examination import Examination, examine, remaining_term
+from ehsvjax.diagnosis.decision.search import select
+from ehsvjax.diagnosis.decision.verdict import verdict_of
+from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
+from ehsvjax.diagnosis.results.diagnosis import Diagnosis
+from ehsvjax.diagnosis.results.extension import as_fit
+from ehsvjax.diagnosis.results.gain import gain_of
+from ehsvjax.diagnosis.results.misfit import misfit_of
+from ehsvjax.diagnosis.results.suspects import excluded_by, table_of, unseen_by
+from ehsvjax.draws import check_key
+from ehsvjax.effects import BANK
+from ehsvjax.effects.effect import Effect
+from ehsvjax.fit import Fit
+from ehsvjax.population import stack_records
+from ehsvjax.record import Record, checked_records
+from ehsvjax.simulate import input_array
+
+# Fewer cannot tell noise from misfit.
+_LEAST_SAMPLES = 100
+
+
+def diagnose(
+    fit: Fit,
+    records: Record | Sequence[Record],
+    validation: Record | Sequence[Record] | None = None,
+    *,
+    key: Key[Array, ""],
+    bank: Sequence[Effect] = BANK,
+    progress: bool | None = None,
+) -> Diagnosis:
+    """Say what a fitted model gets wrong on records, name the cause, extend the model and measure the gain.
+
+    Every effect of the bank is tried at every signal of the model that takes it; see `ehsvjax.effects` for how to add
+    one of yours. The first call for a model and a record's length compiles for some 10 s, further ones nothing.
+
+    Several records share the parameters of the model and the causes; each has its own length, sample period, outputs,
+    known constants, initial conditions and noise, and of a cause that goes by its clock, a drift or a periodic force,
+    its own amplitudes.
+
+    Args:
+        fit: of the model, by `identify`.
+        records: measured, one or several; those that were fitted, or others.
+        validation: other records, on which the gain is measured; by default each of several records is predicted from
+            the others, and the last 30% of a single one are held back.
+        key: random key, `jax.random.key(0)`, for the intervals of the gain.
+        bank: the candidate effects.
+        progress: show a bar with the stage and the time that is left; by default in a terminal or a notebook.
+
+    Raises:
+        ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short,
+            an effect of yours that fits no signal of the model, or one that is in the bank
+            twice.
+
+    """
+    bank = _check_bank(bank)
+    measured = checked_records(records)
+    unseen = () if validation is None else checked_records(validation, "validation")
+    _check(fit, measured, unseen, key, progress)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
+    with progress_bar(progress) as say:
+        return _diagnosed(fit, measured, unseen, bank, rng, say)
+
+
+def _diagnosed(
+    fit: Fit,
+    records: tuple[Record, ...],
+    validation: tuple[Record, ...],
+    bank: tuple[Effect, ...],
+    rng,
+    say: Progress,
+) -> Diagnosis:
+    say("simulating the model", 0.0)
+    bench = workbench(fit, records, bank)
+    check_own_effects(bench, bank)
+    bench, outliers = _without_spikes(bench)
+    selection = select(bench, say)
+    say("testing what is left", 0.8)
+    examined = examine(selection)
+    nominal = as_fit(examined.selection, selection.nominal, ())
+    wider, gain, verdict = _judged(examined, nominal, validation, rng)
+    if verdict[0] == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
+        # What was added on the way to no explanation does not predict: it is left out again, and all is judged anew.
+        examined = examine(selection.without_causes())
+        wider, gain, verdict = _judged(examined, nominal, validation, rng)
+    say("measuring the gain", 0.95)
+    selection = examined.selection
+    word, causes, alternatives = verdict
+    suspected = tuple(dict.fromkeys([*causes, *(name for group in alternatives for name in group.causes)]))
+    return Diagnosis(
+        verdict=word,
+        causes=causes,
+        alternatives=alternatives,
+        table=table_of(selection),
+        extended=wider,
+        gain=gain,
+        misfit=misfit_of(examined, outliers),
+        excluded=() if word == "unexplained" else excluded_by(selection, suspected),
+        unseen=unseen_by(selection, suspected),
+        innocent=examined.innocent,
+        missing=remaining_term(examined),
+        process_noise=examined.chance,
+        integration=selection.integration,
+        fit=fit,
+        records=records,
+    )
+
+
+def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...], rng: np.random.Generator):
+    """Return the extended model's fit, its gain, and the verdict."""
+    selection, wider = examined.selection, nominal
+    if selection.included:
+        wider = as_fit(selection, selection.final, selection.included)
+    return wider, gain_of(selection, nominal, wider, validation, rng), verdict_of(examined)
+
+
+def _check(fit, records, validation, key, progress) -> None:
+    if not isinstance(fit, Fit):
+        raise ValueError(f"expected a fit as identify returns it, got {type(fit).__name__}")
+    for one in (*records, *validation):
+        if not set(one.outputs) & set(fit.outputs):
+            raise ValueError(
+                f"expected {one.name} to hold an output that was fitted, {', '.join(fit.outputs)}; it has "
+                f"{', '.join(one.outputs) or 'none'}"
+            )
+        input_array(fit.model, one)
+    check_key(key)
+    if progress is not None:
+        flag("progress", progress)
+    for record in records:
+        if set(record.outputs) - set(fit.outputs):
+            raise ValueError(
+                f"expected records with outputs that were fitted, {', '.join(fit.outputs)}; {record.name} also has "
+                f"{', '.join(sorted(set(record.outputs) - set(fit.outputs)))}: drop them with .select, or fit them too"
+            )
+        measured = min(int(np.isfinite(values).sum()) for values in record.outputs.values())
+        if measured < _LEAST_SAMPLES:
+            raise ValueError(
+                f"expected at least {_LEAST_SAMPLES} measured samples of every output of {record.name}, to tell noise "
+                f"from misfit; got {measured}"
+            )
+    stack_records(fit.model, records)
+
+
+def _check_bank(bank) -> tuple[Effect, ...]:
+    """Return the bank as a tuple."""
+    expected = "expected bank to be a sequence of effects, such as (*ehsvjax.effects.BANK, my_effect)"
+    if not isinstance(bank, Iterable):
+        raise ValueError(f"{expected}; got {type(bank).__name__}")
+    bank = tuple(bank)
+    others = [type(effect).__name__ for effect in bank if not isinstance(effect, Effect)]
+    if others or not bank:
+        raise ValueError(f"{expected}; got {', '.join(others) or 'none'} in it")
+    numbers = [(e.name, e.kind, p.name) for e in bank for p in e.parameters]
+    twice = sorted({name for name, kind, number in numbers if numbers.count((name, kind, number)) > 1})
+    if twice:
+        raise ValueError(
+            f"expected every effect of the bank once, got {', '.join(twice)} twice: give yours other names"
+        )
+    return bank
+
+
+def _without_spikes(bench: Workbench) -> tuple[Workbench, Bool[np.ndarray, "record time signal"]]:
+    """Return the bench without readings that stand alone, and where they are."""
+    samples = bench.problem.samples
+    residual = samples.outputs - bench.simulated(bench.nominal[None])[0]
+    alone = spikes(residual, samples.measured, samples.outputs)
+    kept = samples._replace(measured=samples.measured & ~alone)
+    return replace(bench, problem=replace(bench.problem, samples=kept)), alone

@@ -1,0 +1,1 @@
+"""What a person sees: the diagnosis, its tables, words, pictures and page."""

@@ -1,0 +1,127 @@
+"""The result of a diagnosis: verdict, causes, what could be there instead, the extended model, and its gain."""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+from ehsvjax.diagnosis.decision.search import Integration
+from ehsvjax.diagnosis.decision.verdict import Alternative
+from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
+from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
+from ehsvjax.diagnosis.results.gain import Gain
+from ehsvjax.diagnosis.results.misfit import Misfit
+from ehsvjax.effects import BANK
+from ehsvjax.effects.effect import Effect
+from ehsvjax.fit import Fit
+from ehsvjax.models.model import Model
+from ehsvjax.record import Record
+
+if TYPE_CHECKING:
+    import pandas
+
+
+class Excluded(NamedTuple):
+    """An effect that a record excludes above a size, in the unit of the effect's first number."""
+
+    cause: str
+    above: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What a fitted model gets wrong on records, and why. Made by `diagnose`; print it.
+
+    Attributes:
+        verdict: "adequate", "named", "ambiguous" or "unexplained".
+        causes: names of the effects that are missing in the model, best first; empty unless named or ambiguous.
+        alternatives: for each cause that is not alone: all that could be there instead, itself among them.
+        table: every candidate: signal, size, unit, score, p-values, likelihood gain, smallest size that the record
+            could have shown, and what it is confounded with.
+        extended: the fit of the extended model; the refitted nominal one where nothing was found.
+        gain: on data that were not used for fitting.
+        misfit: what the nominal model gets wrong.
+        excluded: effects that the record excludes, above which size.
+        unseen: effects that the record cannot show at all, whatever their size.
+        innocent: whether what the extended model leaves depends on nothing any more.
+        missing: where something is left, the term that is missing, estimated without a form; where several causes
+            were found, the one term that would explain the record as well, if there is one.
+        process_noise: the random force that was found, if it is the cause.
+        integration: the step that was needed, and what its arithmetic is worth.
+        fit: the fit that was diagnosed.
+        records: on which.
+
+    """
+
+    verdict: str
+    causes: tuple[str, ...]
+    alternatives: tuple[Alternative, ...]
+    table: "pandas.DataFrame"
+    extended: Fit
+    gain: Gain
+    misfit: Misfit
+    excluded: tuple[Excluded, ...]
+    unseen: tuple[str, ...]
+    innocent: bool
+    missing: MissingTerm | None
+    process_noise: ProcessNoise | None
+    integration: Integration
+    fit: Fit
+    records: tuple[Record, ...]
+
+    @property
+    def record(self) -> Record:
+        """The first of the records."""
+        return self.records[0]
+
+    def __str__(self) -> str:
+        """Return the diagnosis in a few sentences."""
+        from ehsvjax.diagnosis.results.words import sentences
+
+        return "\n".join(sentences(self))
+
+    __repr__ = __str__
+
+    def plot(self):
+        """Draw the misfit, the suspects, what the extended model leaves; returns the matplotlib figure."""
+        from ehsvjax.diagnosis.results.pictures import plot_diagnosis
+
+        return plot_diagnosis(self)
+
+    def report(self, path: str | os.PathLike) -> None:
+        """Write one HTML page that needs no other file: misfit, suspects, verdict, extended model, gain, next step."""
+        from ehsvjax.diagnosis.results.page import write_page
+
+        write_page(self, path)
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.
+
+        Raises:
+            OSError: if it cannot be written; a file that was there stays as it was.
+
+        """
+        from ehsvjax.storage import save_diagnosis
+
+        save_diagnosis(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] = BANK) -> "Diagnosis":
+        """Read a diagnosis that `save` wrote: it prints, draws and reports the same.
+
+        Args:
+            path: the file.
+            model: needed for a model of your own, as equations are not stored: the one that was fitted; those of this
+                package are made again.
+            bank: needed for an effect of your own, `(*ehsvjax.effects.BANK, my_effect)`.
+
+        Raises:
+            ValueError: if the file holds no diagnosis, was altered, or needs a model or an effect that was not handed
+                over.
+            OSError: if the file is not there or may not be read.
+
+        """
+        from ehsvjax.storage import load_diagnosis
+
+        return load_diagnosis(path, model, bank)

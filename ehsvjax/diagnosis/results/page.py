@@ -1,0 +1,66 @@
+"""A diagnosis as one HTML page that needs no other file, written by Jinja2 with every text escaped."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from ehsvjax.checks import file_path
+from ehsvjax.diagnosis.results import words
+from ehsvjax.diagnosis.results.diagnosis import Diagnosis
+from ehsvjax.diagnosis.results.pictures import plot_diagnosis
+from ehsvjax.files import written_whole
+from ehsvjax.plots import embedded, plot_fit, to_png
+
+_HEADS = ("cause", "signal", "size", "unit", "score", "p, whole search", "gain", "smallest to be found", "looks like")
+
+
+def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
+    """Write the page.
+
+    Args:
+        diagnosis: what it tells of.
+        path: the file, `.html`; its folder is made if need be.
+
+    """
+    environment = Environment(
+        loader=PackageLoader("ehsvjax.diagnosis.results", "."), autoescape=True, undefined=StrictUndefined
+    )
+    page = environment.get_template("page.html").render(
+        diagnosis=diagnosis,
+        title=words.title(diagnosis),
+        these=words.these(diagnosis),
+        verdict=words.verdict(diagnosis),
+        misfit=words.misfit_lines(diagnosis),
+        causes=words.cause_lines(diagnosis),
+        gain=words.gain_lines(diagnosis),
+        following=words.next_lines(diagnosis),
+        heads=_HEADS,
+        rows=[_row(row) for row in diagnosis.table.itertuples()],
+        tests=diagnosis.misfit.tests,
+        tests_after=diagnosis.misfit.tests_after,
+        extended=str(diagnosis.extended),
+        picture=embedded(to_png(plot_diagnosis(diagnosis))),
+        fitted=[embedded(to_png(plot_fit(diagnosis.extended, record))) for record in diagnosis.extended.records],
+    )
+    file = Path(file_path("path", path))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(file) as whole:
+        whole.write(page.encode())
+
+
+def _row(row) -> dict:
+    return {
+        "included": row.included,
+        "cells": (
+            row.cause, row.signal, _number(row.size), row.unit, _number(row.score), _number(row.p_corrected),
+            _number(row.likelihood_gain), _number(row.smallest_detectable), row.confounded_with,
+        ),
+    }  # fmt: skip
+
+
+def _number(value: float) -> str:
+    if not np.isfinite(value):
+        return "–"
+    return f"{value:.3g}".replace("-", "−")

@@ -1,0 +1,230 @@
+"""A diagnosis in sentences."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
+
+if TYPE_CHECKING:
+    from ehsvjax.diagnosis.results.diagnosis import Diagnosis
+
+# Excluded effects that are printed.
+_NAMED = 10
+
+
+def sentences(diagnosis: "Diagnosis") -> list[str]:
+    """Return the diagnosis as lines of text, what matters first."""
+    lines = [f"{title(diagnosis)}: {verdict(diagnosis)}", ""]
+    lines += [f"  {line}" for line in (*misfit_lines(diagnosis), *cause_lines(diagnosis), *gain_lines(diagnosis))]
+    lines += [f"  {line}" for line in (*next_lines(diagnosis), integration_line(diagnosis))]
+    return lines
+
+
+def title(diagnosis: "Diagnosis") -> str:
+    """Return what was diagnosed on which records."""
+    names = [record.name for record in diagnosis.records]
+    return f"{diagnosis.fit.model.name} on {' and '.join(filter(None, [', '.join(names[:-1]), names[-1]]))}"
+
+
+def integration_line(diagnosis: "Diagnosis") -> str:
+    """Return at which step all was simulated, and what that is worth."""
+    step, left_out, worth = diagnosis.integration
+    readings = " and ".join(f"{count} of {name}" for name, count in left_out.items() if count)
+    unknown = f"; readings that it cannot know, as beside a jump, carry no weight: {readings}" if readings else ""
+    much = "" if worth < 1.0 else ": more than it should; simulate the model with a method for stiff equations"
+    return (
+        f"simulated in steps of {1e3 * step:.3g} ms: at half of it no comparison changes by more than "
+        f"{max(worth, 0.01):.2g} noise variances{much}{unknown}"
+    )
+
+
+def verdict(diagnosis: "Diagnosis") -> str:
+    """Return the verdict in a sentence."""
+    left = "" if diagnosis.innocent else " Something is left that no candidate explains."
+    if diagnosis.verdict == "adequate":
+        coloured = any(m.coloured for outputs in diagnosis.misfit.by_record for m in outputs.values())
+        chance = " It is correlated: whether it is chance, a repeat of the experiment tells." if coloured else ""
+        return f"adequate. What the model leaves is noise: it depends on nothing that runs along the model.{chance}"
+    if diagnosis.verdict == "named":
+        return f"{causes(diagnosis)}.{_explained(diagnosis)}{left}"
+    if diagnosis.verdict == "ambiguous":
+        return f"ambiguous: {causes(diagnosis)}: {these(diagnosis)} cannot tell.{_explained(diagnosis)}{left}"
+    better = "a single term explains the record better than several effects of the bank together"
+    why = better if diagnosis.innocent else "no effect of the bank leaves an innocent residual"
+    return f"unexplained. Something is missing, and {why}."
+
+
+def _explained(diagnosis: "Diagnosis") -> str:
+    """Return which share of what was wrong the causes explain on data that were not used, where chance could not."""
+    shares = {n: g.share_removed for n, g in diagnosis.gain.outputs.items() if g.share_interval[0] > 0.0}
+    if not shares:
+        return ""
+    each = [f"{100 * min(share, 1.0):.0f}%" + (f" ({name})" if len(diagnosis.gain.outputs) > 1 else "")
+            for name, share in shares.items()]  # fmt: skip
+    return f" {' and '.join(each)} of what was wrong is explained, on data that were not used."
+
+
+def causes(diagnosis: "Diagnosis") -> str:
+    """Return the causes in words, each with what it cannot be told from; none if nothing is named."""
+    groups = [" or ".join(a.causes) for a in diagnosis.alternatives]
+    alone = [c for c in diagnosis.causes if all(c not in a.causes for a in diagnosis.alternatives)]
+    return ("; and " if groups else " and ").join([*alone, *groups])
+
+
+def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return what the nominal model gets wrong, a line for each output."""
+    lines = []
+    # What was fitted to these very records is refitted to where it was.
+    as_fitted = set(diagnosis.records) == set(diagnosis.fit.records)
+    for record, name, m in _of_each(_names(diagnosis), diagnosis.misfit.by_record):
+        unit = _spaced(diagnosis.fit.model.unit(name))
+        kind = "coloured" if m.coloured else "white"
+        predicted = "" if as_fitted else f"rmse {m.rmse_predicted:.4g}{unit} as it was fitted; refitted "
+        lines.append(
+            f"{record}{name}: {predicted}rmse {m.rmse:.4g}{unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
+            f"{100 * m.above_noise:.1f}% of the squared error is misfit"
+        )
+        if m.outliers.any():
+            lines.append(f"  {int(m.outliers.sum())} readings stand alone; they were left out")
+        if m.lattice is not None:
+            share = m.lattice**2 / 12.0 / m.noise_floor**2
+            lines.append(
+                f"  the readings lie on a lattice of {m.lattice:.3g}{unit}: {100 * min(share, 1.0):.0f}% of the noise"
+            )
+    if diagnosis.verdict != "adequate" and diagnosis.misfit.tests:
+        first = diagnosis.misfit.tests[0]
+        repeating = _repeating(first.period, quantity_unit(diagnosis.fit.model, first.quantity))
+        lines.append(
+            f"the residual depends on {first.quantity}{repeating} (seen from {first.place}): p "
+            f"{_p(first.corrected)} for all {len(diagnosis.misfit.tests)} tests together"
+        )
+    return lines
+
+
+def cause_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return the causes with their sizes, or the missing term."""
+    lines = []
+    included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
+    for row in included.drop_duplicates("cause").itertuples():
+        what = (
+            _instead(diagnosis, str(row.cause)) or f"{row.cause} at {row.signal}: {_sizes(diagnosis, str(row.cause))}"
+        )
+        lines.append(f"{what}; it gains {row.likelihood_gain:.4g} times what chance would")
+    if diagnosis.process_noise is not None:
+        place, intensity, *_ = diagnosis.process_noise
+        unit = diagnosis.fit.model.unit(place)
+        density = f"({unit})^2 s" if unit else "s"
+        lines.append(f"process_noise: a random force at {place} of spectral density {intensity:.3g} {density}")
+    m = diagnosis.missing
+    if m is not None:
+        unit = _spaced("of its value" if m.relative else m.unit)
+        peak = int(np.argmax(np.abs(m.estimate)))
+        # Several causes may stand for one that the bank lacks.
+        instead = diagnosis.innocent and diagnosis.verdict != "unexplained"
+        along = f"as a function of {m.quantity}{_repeating(m.period, m.quantity_unit)}"
+        lines.append(
+            f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, {along}: "
+            f"up to {m.estimate[peak]:.3g} +/- {m.deviation[peak]:.2g}{unit} at {m.at[peak]:.3g}"
+            f"{_spaced(m.quantity_unit)}; it takes {100 * m.explained:.0f}% of what is left (see .missing and .plot())"
+        )
+        if m.alike:
+            others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
+            lines.append(f"a term {others} would explain as much")
+    return lines
+
+
+def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Any]]:
+    """Return what there is of each output in each record, with the names of both; of a single record without."""
+    said = [f"{name}, " if len(names) > 1 else "" for name in names]
+    return [(name, output, m) for name, outputs in zip(said, by_record, strict=True) for output, m in outputs.items()]
+
+
+def _names(diagnosis: "Diagnosis") -> list[str]:
+    return [record.name for record in diagnosis.records]
+
+
+def _sizes(diagnosis: "Diagnosis", cause: str) -> str:
+    """Return the numbers of a cause with their units; of its run, one for each record."""
+    model, said = diagnosis.extended.model, []
+    for p in model.parameters:
+        own, _, number = p.name.rpartition(".")
+        if own == cause:
+            shared = diagnosis.extended.parameters.get(p.name)
+            each = [record.constants[p.name] for record in diagnosis.extended.records] if shared is None else [shared]
+            values = ", ".join(f"{value:.4g}" for value in each)
+            said.append(f"{number} {values}{_spaced(p.unit)}")
+    return ", ".join(said)
+
+
+def _instead(diagnosis: "Diagnosis", cause: str) -> str | None:
+    """Return what a constant is instead of what was given; None for any other cause."""
+    given = next((p for p in diagnosis.fit.model.parameters if p.name == cause), None)
+    found_at = diagnosis.extended.parameters
+    if given is None or not {f"{cause}.error", f"{cause}.value"} & set(found_at):
+        return None
+    error = found_at.get(f"{cause}.error")
+    found = found_at[f"{cause}.value"] if error is None else given.value * (1.0 + error)
+    return f"{cause}: {found:.4g}{_spaced(given.unit)} instead of the {given.value:.4g} that was given"
+
+
+def gain_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return what the extension gains, a line for each output."""
+    lines = []
+    for record, name, g in _of_each(diagnosis.gain.records, diagnosis.gain.by_record):
+        unit = _spaced(diagnosis.fit.model.unit(name))
+        if diagnosis.extended.model.name == diagnosis.fit.model.name:
+            lines.append(
+                f"on {diagnosis.gain.on}: {record}{name} rmse {g.rmse_before:.4g}{unit}, noise "
+                f"{g.noise_floor:.4g}{unit}"
+            )
+            continue
+        line = (
+            f"on {diagnosis.gain.on}: {record}{name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g}{unit} "
+            f"(noise {g.noise_floor:.4g}), fit {g.fit_before:.2f} -> {g.fit_after:.2f}%"
+        )
+        if np.isfinite(g.share_removed):
+            low, high = g.share_interval
+            line += (
+                f"; {100 * g.share_removed:.1f}% of the removable error removed "
+                f"(95%: {100 * low:.1f} to {100 * high:.1f})"
+            )
+        lines.append(line)
+    return lines
+
+
+def next_lines(diagnosis: "Diagnosis") -> list[str]:
+    """Return what to do next, and what the record excludes."""
+    lines = [
+        f"to tell {' from '.join(a.causes)}: {a.settled_by}" for a in diagnosis.alternatives if a.settled_by
+    ]  # fmt: skip
+    if diagnosis.verdict == "unexplained":
+        lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
+    if diagnosis.verdict == "adequate":
+        said = "; ".join(f"{e.cause} above {e.above:.2g}{_spaced(e.unit)}" for e in diagnosis.excluded[:_NAMED])
+        more = len(diagnosis.excluded) - _NAMED
+        lines.append(
+            f"excluded, as it would be found in 95% of such records: {said}"
+            + (f"; and {more} more (see .excluded)" if more > 0 else "")
+        )
+        if diagnosis.unseen:
+            lines.append(f"{these(diagnosis)} cannot show: {', '.join(diagnosis.unseen)}")
+    return lines
+
+
+def these(diagnosis: "Diagnosis") -> str:
+    """Return the records in words."""
+    return "this record" if len(diagnosis.records) == 1 else "these records"
+
+
+def _repeating(period: float | None, unit: str) -> str:
+    return "" if period is None else f", repeating every {period:.3g}{_spaced(unit)}"
+
+
+def _spaced(unit: str) -> str:
+    return f" {unit}" if unit else ""
+
+
+def _p(p: float) -> str:
+    return f"= {p:.2g}" if p > 1e-12 else "< 1e-12"
