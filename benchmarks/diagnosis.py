@@ -104,7 +104,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
             row
             | {
                 "verdict": d.verdict,
-                "causes": d.causes,
+                "causes": d.names,
                 "groups": [a.causes for a in d.alternatives],
                 "innocent": d.innocent,
                 "seconds": time.perf_counter() - identified,

@@ -211,7 +211,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
             row
             | {
                 "verdict": d.verdict,
-                "causes": d.causes,
+                "causes": d.names,
                 "groups": [a.causes for a in d.alternatives],
                 "innocent": d.innocent,
                 "arithmetic": d.integration.worth,

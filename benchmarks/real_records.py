@@ -198,7 +198,7 @@ RIGS: dict[str, Callable[[], Rig]] = {
 def judged(rig: Rig, diagnosis: Diagnosis) -> str:
     """Return which of the causes that are needed were named, alone or in a group, and which others."""
     groups = [a.causes for a in diagnosis.alternatives]
-    groups += [(c,) for c in diagnosis.causes if not any(c in group for group in groups)]
+    groups += [(c,) for c in diagnosis.names if not any(c in group for group in groups)]
     if not groups:
         return "no name"
     missed = [one for one in rig.needed if not any(_known(group, (one,)) for group in groups)]

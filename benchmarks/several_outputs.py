@@ -184,7 +184,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
             continue
         row |= {
             "verdict": d.verdict,
-            "causes": d.causes,
+            "causes": d.names,
             "groups": [a.causes for a in d.alternatives],
             "step_size": d.integration.step_size,
             "left_out": sum(d.integration.left_out.values()),

@@ -163,7 +163,7 @@ class Fit:
                 conditions from.
 
         """
-        simulated = simulate(self.model, record, self.parameters, self.initial_of(record, initial))
+        simulated = simulate(self.model, record, self.parameters_of(record), self.initial_of(record, initial))
         warn_of_failure(self.model, record, simulated)
         return simulated
 
@@ -196,6 +196,15 @@ class Fit:
     def score(self, record: Record, initial: Mapping[str, float] | str = "estimate") -> Score:
         """Judge the prediction of one record, fitted or new; arguments and refusals as for `residuals`."""
         return score_of([checked_record(record)], [self.residuals(record, initial)])
+
+    def parameters_of(self, record: Record) -> dict[str, float]:
+        """Return the parameters, name -> value, with which `simulate` runs a record, SI.
+
+        What is of a run, a drift or a disturbance that goes by the clock, is absent in a record that was not fitted.
+        """
+        if any(record is fitted for fitted in self.records):
+            return self.parameters
+        return self.parameters | {n: v for n, v in self.model.of_run.items() if n in self.parameters}
 
     @functools.cached_property
     def _score(self) -> Score:

@@ -163,7 +163,7 @@ def estimate_initial(fit: Fit, record: Record) -> dict[str, float]:
             'initial="nominal" or their values by name'
         )
     known = replace(fit.model, parameters=tuple(p._replace(fixed=True) for p in fit.model.parameters))
-    known = known.with_bounds(fixed=fit.parameters)
+    known = known.with_bounds(fixed=fit.parameters_of(record))
     variance = {name: v for name, v in fit.noise_variance.items() if name in record.outputs}
     first, *others = fit.initial
     given = {

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import ehsvjax
+from ehsvjax.effects import BANK, attach
 from ehsvjax.record_checks import checked_constants
 from tests.small_models import DAMPING, STIFFNESS, carriage, carriage_plant, record_of
 
@@ -105,3 +106,17 @@ def test_a_constant_that_the_model_does_not_have_is_refused(records):
 def test_what_cannot_be_known_is_refused(constants, said):
     with pytest.raises(ValueError, match=said):
         checked_constants(constants)
+
+
+def test_what_is_of_a_run_is_absent_in_any_other():
+    """A sensor that drifted while one record was taken does not drift from the start of the next."""
+    drifting, other = recorded(40.0, 1), recorded(40.0, 2)
+    drift = 0.05 * drifting.time / drifting.time[-1]
+    drifting = ehsvjax.Record(drifting.time, drifting.inputs, {"position": drifting.outputs["position"] + drift})
+    duration = len(drifting) * drifting.sample_period
+    model = attach(carriage(), {"sensor_drift@position.drift": (-0.2, 0.2)}, duration=duration, bank=BANK)
+    fit = ehsvjax.identify(model, drifting, key=KEY, population=20, generations=5)
+    assert fit.parameters["sensor_drift@position.drift"] == pytest.approx(0.05, abs=0.005)
+    assert fit.score(other).rmse["position"] == pytest.approx(fit.score(drifting).rmse["position"], rel=0.1)
+    assert fit.parameters_of(other)["sensor_drift@position.drift"] == 0.0
+    assert fit.parameters_of(drifting) == fit.parameters

@@ -138,10 +138,24 @@ def test_attached_numbers_have_the_units_of_the_table(diagnosis):
 
 def test_the_cause_is_named(diagnosis):
     assert diagnosis.verdict == "named", str(diagnosis)
-    assert diagnosis.causes == ("sensor_bias",)
+    assert diagnosis.names == ("sensor_bias",)
     assert diagnosis.alternatives == ()
     assert diagnosis.innocent
     assert diagnosis.missing is None
+
+
+def test_a_cause_says_how_sure_how_large_and_what_it_explains(diagnosis):
+    (cause,) = diagnosis.causes
+    assert cause.signal == "position" and cause.probability > 0.99 and not cause.of_run
+    (size,) = cause.sizes
+    assert (size.number, size.unit, size.record) == ("bias", "", None)
+    assert size.value == diagnosis.extended.parameters["sensor_bias.bias"]
+    assert abs(size.value - BIAS) < 4.0 * size.standard_error
+    # Found by differentiation of another program, in white noise.
+    assert size.standard_error == pytest.approx(diagnosis.extended.standard_errors["sensor_bias.bias"], rel=0.3)
+    assert cause.share == pytest.approx(1.0, abs=0.02)
+    assert cause.records == (NAME,) and cause.contradicted_by == ()
+    assert diagnosis.left.innocent and diagnosis.left.share["position"] == pytest.approx(0.0, abs=0.02)
 
 
 def test_the_table_has_every_effect_that_the_model_can_have(diagnosis):
@@ -252,10 +266,15 @@ def test_what_is_printed_has_no_gap_where_a_unit_is_none(diagnosis):
 
 
 def test_causes_that_cannot_be_told_apart_are_told_as_such(diagnosis):
-    either = Alternative(("sensor_bias", "input_bias"), "")
-    causes = ("sensor_bias", "sensor_lag")
+    either = Alternative(("sensor_bias", "input_bias"), "", (0.7, 0.3))
+    first = diagnosis.causes[0]._replace(probability=0.7)
+    causes = (first, first._replace(name="sensor_lag", sizes=(), probability=0.999))
     unsure = dataclasses.replace(diagnosis, verdict="ambiguous", causes=causes, alternatives=(either,))
-    assert "ambiguous: sensor_lag; and sensor_bias or input_bias: this record cannot tell." in str(unsure)
+    size = f"{first.sizes[0].value:.3g}"
+    said = (
+        f"ambiguous: sensor_lag (certain); and sensor_bias ({size}, 70%) or input_bias (30%): this record cannot tell."
+    )
+    assert said in str(unsure)
     title = " ".join(unsure.plot().get_suptitle().split())
     assert title.endswith(": ambiguous: sensor lag; and sensor bias or input bias")
 
@@ -263,7 +282,7 @@ def test_causes_that_cannot_be_told_apart_are_told_as_such(diagnosis):
 @pytest.mark.parametrize(
     ("innocent", "why"),
     [(True, "a single term explains the record better than several effects of the bank together"),
-     (False, "no effect of the bank leaves an innocent residual")],
+     (False, "no effect of the bank has earned its place")],
 )  # fmt: skip
 def test_why_it_is_unexplained_is_said(diagnosis, innocent, why):
     unexplained = dataclasses.replace(diagnosis, verdict="unexplained", causes=(), innocent=innocent)
@@ -327,7 +346,7 @@ def test_the_extended_fit_is_adequate_on_the_same_record(diagnosis, record):
     assert effects_of(diagnosis.extended.model) == ("sensor_bias",)
     again = ehsvjax.diagnose(diagnosis.extended, record, key=KEY)
     assert again.verdict == "adequate", str(again)
-    assert again.causes == () and again.innocent and again.missing is None
+    assert again.names == () and again.innocent and again.missing is None
     assert not again.table["included"].any()
     assert effects_of(again.extended.model) == ("sensor_bias",)
     assert again.extended.parameters["sensor_bias.bias"] == pytest.approx(BIAS, abs=0.01)
@@ -369,7 +388,7 @@ def test_another_record_of_the_same_length_compiles_nothing_and_may_miss_samples
     with compilations() as compiled:
         found = ehsvjax.diagnose(own, other, key=jax.random.key(9))
     assert compiled == []
-    assert found.causes == ("sensor_bias",), str(found)
+    assert found.names == ("sensor_bias",), str(found)
     assert found.extended.parameters["sensor_bias.bias"] == pytest.approx(-0.2, abs=0.02)
     misfit = found.misfit.outputs["position"]
     assert np.flatnonzero(np.isnan(misfit.residual)).tolist() == gap
@@ -391,7 +410,7 @@ def test_a_record_that_misses_its_end_is_diagnosed(diagnosis):
     del diagnosis  # has compiled everything
     record = measured(11, BIAS, missing=range(400, SAMPLES))
     found = ehsvjax.diagnose(identified(record), record, key=KEY)
-    assert found.causes == ("sensor_bias",), str(found)
+    assert found.names == ("sensor_bias",), str(found)
 
 
 # --- An effect of one's own ---
@@ -409,7 +428,7 @@ def test_an_effect_of_ones_own_is_found():
     )
     record = measured(2, cogging=0.15)
     found = ehsvjax.diagnose(identified(record), record, key=KEY, bank=(*BANK, cogging))
-    assert found.causes == ("cogging",), str(found)
+    assert found.names == ("cogging",), str(found)
     extended = found.extended
     assert abs(extended.parameters["cogging.depth"] - 0.15) < 5.0 * extended.standard_errors["cogging.depth"]
     assert found.gain.outputs["position"].rmse_after == pytest.approx(NOISE, rel=0.3)

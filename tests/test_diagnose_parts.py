@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, corrected, probabilities, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.readings import lattice, spikes
-from ehsvjax.diagnosis.bench.significance import INSEPARABLE, corrected, smallest_p_values
 from ehsvjax.diagnosis.hypotheses.curves import _all_waves, knots_along, single_waves
 from ehsvjax.diagnosis.hypotheses.dependence import _log_of_chi_square
 from ehsvjax.diagnosis.results.gain import _gain
@@ -289,3 +289,18 @@ def test_gains_are_of_opposite_sign_the_other_way_round_and_of_no_unit(seed):
     assert noise.gained(left, more) == pytest.approx(-noise.gained(more, left))
     assert noise.gained(left, more) == pytest.approx(in_mm.gained(1e3 * left, 1e3 * more))
     assert noise.gained(left, left) == 0.0
+
+
+@given(st.lists(st.floats(0.0, 1e4), min_size=1, max_size=8), st.floats(-1e3, 1e3))
+@settings(deadline=None)
+def test_probabilities_are_those_of_bayes_whatever_is_common_to_all(deficits, common):
+    found = probabilities(deficits)
+    assert np.sum(found) == pytest.approx(1.0)
+    assert found == pytest.approx(probabilities([d + common for d in deficits]), abs=1e-9)
+    likelihoods = np.exp(-0.5 * (np.array(deficits) - min(deficits)))
+    assert found == pytest.approx(likelihoods / np.sum(likelihoods))
+
+
+def test_what_cannot_be_there_has_no_probability():
+    assert probabilities([0.0, np.inf, 0.0]) == pytest.approx([0.5, 0.0, 0.5])
+    assert probabilities([0.0, 2.0 * np.log(3.0)]) == pytest.approx([0.75, 0.25])

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import ehsvjax
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import bounds_of, padded, refit
-from ehsvjax.diagnosis.bench.significance import INSEPARABLE
 from ehsvjax.diagnosis.bench.workbench import workbench
 from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen

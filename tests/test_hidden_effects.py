@@ -49,7 +49,7 @@ def base(cause: str) -> str:
 
 
 def held(found: Diagnosis) -> set[str]:
-    return {base(c) for c in found.causes} | {base(c) for a in found.alternatives for c in a.causes}
+    return {base(c) for c in found.names} | {base(c) for a in found.alternatives for c in a.causes}
 
 
 def check_found(hidden: Hidden) -> None:
@@ -59,7 +59,7 @@ def check_found(hidden: Hidden) -> None:
     else:
         assert found.verdict in ("named", "ambiguous"), said
         assert hidden.names[0] in held(found), said
-        assert len(found.causes) == 1, said
+        assert len(found.names) == 1, said
 
 
 # One process compiles for one model.
@@ -97,7 +97,7 @@ def test_an_effect_drawn_afresh_is_found(model):
 def test_nothing_hidden_is_adequate(model, kind):
     found, _, said = diagnosed(Hidden(model, kind, 100 * VARIANCE[model], (), 2))
     assert found.verdict == "adequate", said
-    assert found.causes == () and found.alternatives == ()
+    assert found.names == () and found.alternatives == ()
     assert found.excluded, "an adequate model excludes something"
     if kind == "outliers":
         assert found.misfit.outputs["position"].outliers.any(), said
@@ -123,7 +123,7 @@ def test_what_makes_the_same_record_stays_one_group_beside_a_harmonic_force(seed
     # A frequency that was refitted without the constant force goes far to make up for it.
     hidden = Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], ("harmonic_force", "constant_force"), seed)
     found, _, said = diagnosed(hidden)
-    assert set(map(base, found.causes)) <= {"harmonic_force", "constant_force", "input_bias"}, said
+    assert set(map(base, found.names)) <= {"harmonic_force", "constant_force", "input_bias"}, said
     assert held(found) == {"harmonic_force", "constant_force", "input_bias"}, said
 
 
@@ -148,7 +148,7 @@ def test_a_sensor_that_ends_just_below_the_peaks_is_named():
     fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=100, generations=20,
                            bounds=bounds)  # fmt: skip
     found = diagnose(fit, record, key=jax.random.key(0))
-    assert found.causes == ("sensor_saturation",), str(found)
+    assert found.names == ("sensor_saturation",), str(found)
     assert found.extended.parameters["sensor_saturation.limit"] == pytest.approx(limit, rel=1e-3)
 
 
@@ -182,5 +182,5 @@ def test_readings_coarser_than_the_noise_are_quantised(deviations):
     record = ehsvjax.Record(made.time, {"command": made.command}, {"position": step * np.round(made.position / step)})
     fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=jax.random.key(0), population=50, generations=20)
     found = diagnose(fit, record, key=jax.random.key(0))
-    assert found.causes == ("sensor_quantisation",), str(found)
+    assert found.names == ("sensor_quantisation",), str(found)
     assert found.misfit.outputs["position"].lattice == pytest.approx(step, rel=1e-6)

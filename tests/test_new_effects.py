@@ -26,7 +26,7 @@ def diagnosed(model, record):
 
 
 def suspected(found) -> set[str]:
-    return {*found.causes, *(name for group in found.alternatives for name in group.causes)}
+    return {*found.names, *(name for group in found.alternatives for name in group.causes)}
 
 
 # --- A tank that overflows ---
@@ -49,7 +49,7 @@ def overflowing():
 
 def test_a_tank_that_overflows_has_a_hard_limit(overflowing):
     assert "hard_limit" in suspected(overflowing), str(overflowing)
-    assert len(overflowing.causes) == 1
+    assert len(overflowing.names) == 1
     name = "hard_limit.positive_limit"
     found, error = (of[name] for of in (overflowing.extended.parameters, overflowing.extended.standard_errors))
     assert abs(found - BRIM) < 5.0 * error and error < 0.05 * BRIM
@@ -89,7 +89,7 @@ def test_an_input_that_runs_straight_from_value_to_value_is_a_hold():
     held = record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 5)
     found = diagnosed(carriage(), held)
     assert "input_hold" in suspected(found), str(found)
-    if "input_hold" in found.causes:
+    if "input_hold" in found.names:
         assert found.extended.parameters["input_hold.share"] == pytest.approx(1.0, abs=0.1)
     # Declared as it is, nothing is missing.
     straight = record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 5, hold="linear")
@@ -103,7 +103,7 @@ def test_a_force_that_acts_in_what_is_measured_alone_is_named():
     follows = lsim(([[-100.0]], [[100.0]], [[-100.0]], [[100.0]]), moved, time, X0=moved[0], interp=False)[1]
     force = 200.0 * follows + 30.0 * np.sign(follows)
     found = diagnosed(damper(), record_of(0.01, {"displacement": moved}, {"force": force}, {"force": 1.0}, 3))
-    assert found.causes == ("coulomb_friction",), str(found)
+    assert found.names == ("coulomb_friction",), str(found)
     assert found.extended.parameters["coulomb_friction.force"] == pytest.approx(30.0, rel=0.02)
 
 
@@ -111,7 +111,7 @@ def test_a_sensor_that_shows_a_part_of_the_input_at_once_is_named():
     push = held_levels(6, 20.0, SAMPLES // 20, 20)
     position = carriage_plant(push, PERIOD)[:, 0] + 1e-3 * push
     found = diagnosed(carriage(), record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 6))
-    assert found.verdict == "named" and found.causes == ("feedthrough_of_push",), str(found)
+    assert found.verdict == "named" and found.names == ("feedthrough_of_push",), str(found)
     assert found.extended.parameters["feedthrough_of_push.gain"] == pytest.approx(1e-3, rel=0.05)
 
 

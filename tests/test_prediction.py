@@ -26,7 +26,7 @@ def test_a_periodic_force_is_named_only_if_it_goes_on(until, named):
     record = shaken(until)
     fit = ehsvjax.identify(carriage(), record, key=KEY, population=20, generations=5)
     found = ehsvjax.diagnose(fit, record, key=KEY)
-    suspected = {*found.causes, *(name for a in found.alternatives for name in a.causes)}
+    suspected = {*found.names, *(name for a in found.alternatives for name in a.causes)}
     assert ("harmonic_force" in suspected) == named, str(found)
     gain = found.gain.outputs["position"]
     assert gain.rmse_after <= gain.rmse_before

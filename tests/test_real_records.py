@@ -34,7 +34,25 @@ def test_a_tank_that_overflows_is_found_and_another_record_predicted():
 def test_dry_friction_comes_before_the_gap_and_another_amplitude_is_predicted():
     rig, found = diagnosed("damper")
     assert judged(rig, found).startswith("right"), str(found)
-    assert found.causes[0] == "coulomb_friction"
-    assert any("dead_zone" in names for names in (found.causes, *(a.causes for a in found.alternatives)))
+    assert found.names[0] == "coulomb_friction"
+    assert any("dead_zone" in names for names in (found.names, *(a.causes for a in found.alternatives)))
     (other,) = rig.others
     assert found.extended.score(other).fit_percent["force"] > 84.0
+
+
+def test_slow_misfit_is_not_taken_for_noise():
+    """Of the tanks' other record alone, what is left is ten times the noise that is seen elsewhere."""
+    rig = RIGS["tanks"]()
+    (record,) = rig.others
+    fit = ehsvjax.identify(rig.model, record, key=jax.random.key(0), population=40, generations=10)
+    found = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
+    assert found.verdict != "adequate" and not found.innocent, str(found)
+
+
+def test_what_was_of_one_sweep_is_not_predicted_of_the_other():
+    rig = RIGS["leakage"]()
+    one, other = rig.records
+    fit = ehsvjax.identify(rig.model, one, key=jax.random.key(0), population=40, generations=10)
+    found = ehsvjax.diagnose(fit, one, key=jax.random.key(1))
+    assert {"input_hysteresis", "sensor_lag"} <= {*found.names, *(c for a in found.alternatives for c in a.causes)}
+    assert found.extended.score(other).rmse["flow"] < fit.score(other).rmse["flow"], str(found)

@@ -54,7 +54,7 @@ def bent():
 @of_the_oscillator
 def test_records_of_unlike_length_period_and_noise_share_their_cause(bent):
     records, found = bent
-    assert (found.verdict, found.causes) == ("named", ("cubic_stiffness",)), str(found)
+    assert (found.verdict, found.names) == ("named", ("cubic_stiffness",)), str(found)
     error = found.extended.precision().standard_errors["cubic_stiffness.coefficient"]
     assert abs(found.extended.parameters["cubic_stiffness.coefficient"]) == pytest.approx(COEFFICIENT, abs=4 * error)
     assert found.records == tuple(records) and found.extended.records == tuple(records)
@@ -96,7 +96,7 @@ def test_a_list_of_one_is_that_record(bent):
     records, _ = bent
     fit = fitted(ehsvjax.van_der_pol(), records[0])
     one, listed = diagnose(fit, records[0], key=KEY), diagnose(fit, records[:1], [records[1]], key=KEY)
-    assert one.causes == listed.causes and one.table.equals(listed.table)
+    assert one.names == listed.names and one.table.equals(listed.table)
     assert listed.gain.on == "short, which was not used"
     assert "as it was fitted" not in str(one)
     # How the fit predicts what it has not seen is said before anything is refitted.
@@ -114,7 +114,7 @@ def test_a_periodic_force_has_an_amplitude_of_its_own_in_every_record():
         oscillation(4, 30, 50, 0.02, 1e-2, "quiet"),
     ]
     found = diagnose(fitted(ehsvjax.van_der_pol(), records), records, key=KEY)
-    assert found.causes == ("harmonic_force",), str(found)
+    assert found.names == ("harmonic_force",), str(found)
     assert found.extended.parameters["harmonic_force.frequency"] == pytest.approx(FREQUENCY, rel=1e-2)
     sizes = [
         np.hypot(*(record.constants[f"harmonic_force.{part}"] for part in ("cosine", "sine")))
@@ -138,7 +138,7 @@ def test_a_record_may_hold_outputs_that_another_does_not(held):
         for seed, some in enumerate([held[:1], held])
     ]
     found = diagnose(fitted(carriage(), records), records, key=KEY)
-    assert "stiffness" in found.causes, str(found)
+    assert "stiffness" in found.names, str(found)
     assert [set(outputs) for outputs in found.misfit.by_record] == [set(held[:1]), set(held)]
     assert [set(outputs) for outputs in found.gain.by_record] == [set(held[:1]), set(held)]
     for outputs in found.misfit.by_record:
@@ -154,5 +154,5 @@ def test_what_one_record_cannot_tell_another_supply_pressure_settles():
     both = [full, half]
     together = diagnose(fitted(ehsvjax.servovalve(), both), both, key=KEY)
     assert alone.verdict == "ambiguous" and "constant_load" in alone.alternatives[0].causes, str(alone)
-    assert (together.verdict, together.causes) == ("named", ("constant_load",)), str(together)
+    assert (together.verdict, together.names) == ("named", ("constant_load",)), str(together)
     assert together.extended.parameters["constant_load.force"] == pytest.approx(800.0, rel=0.1)

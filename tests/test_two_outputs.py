@@ -45,7 +45,7 @@ def diagnosis():
 
 def test_a_clean_record_is_adequate(diagnosis):
     assert diagnosis.verdict == "adequate", str(diagnosis)
-    assert diagnosis.causes == () and diagnosis.missing is None and diagnosis.innocent
+    assert diagnosis.names == () and diagnosis.missing is None and diagnosis.innocent
 
 
 def test_the_step_and_what_it_is_worth_is_measured(diagnosis):

@@ -187,4 +187,4 @@ def test_a_single_cause_that_the_record_can_do_without_is_needless(bench):
     noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
     nominal, found = (refit_sets(trials, [[bench.nominal]], [some], noise) for some in ((), (cause,)))
     weighed = _weighed(_look(trials, (cause,), found, noise), nominal)
-    assert weighed.stage.included == (weighed.needless,), weighed.gains
+    assert weighed.stage.included == (weighed.needless,), weighed.needs

@@ -24,7 +24,7 @@ def diagnosed(model, position, seed):
 
 
 def suspected(found) -> set[str]:
-    return {*found.causes, *(name for group in found.alternatives for name in group.causes)}
+    return {*found.names, *(name for group in found.alternatives for name in group.causes)}
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_a_constant_that_is_certain_is_not_blamed_though_it_is_off():
 @of_a_carriage
 def test_a_constant_of_zero_that_is_there_is_named_with_its_size():
     found = diagnosed(carriage(), modulated_plant(PUSH, PERIOD, 0.5), seed=3)
-    assert found.verdict == "named" and found.causes == ("modulation",), str(found)
+    assert found.verdict == "named" and found.names == ("modulation",), str(found)
     assert found.extended.parameters["modulation.value"] == pytest.approx(0.5, abs=0.01)
     assert found.extended.model.parameter("modulation.value").unit == "1/m"
 
@@ -89,5 +89,5 @@ def test_a_stiffness_given_at_half_of_what_it_is_is_found_from_the_position_alon
     found = diagnose(fit, record, key=KEY)
     # The position shows the load's pressure over the supply's alone: twice the stiffness is half of area or supply.
     assert "stiffness" in suspected(found), str(found)
-    assert found.causes[0] in ("stiffness", "piston_area", "supply_pressure"), str(found)
-    assert len(found.causes) == 1 and found.innocent
+    assert found.names[0] in ("stiffness", "piston_area", "supply_pressure"), str(found)
+    assert len(found.names) == 1 and found.innocent

@@ -16,6 +16,7 @@ from ehsvjax.diagnosis.decision.examination import Examination, examine, remaini
 from ehsvjax.diagnosis.decision.search import select
 from ehsvjax.diagnosis.decision.verdict import verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
+from ehsvjax.diagnosis.results.causes import causes_of
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 from ehsvjax.diagnosis.results.extension import as_fit
 from ehsvjax.diagnosis.results.gain import gain_of
@@ -92,25 +93,25 @@ def _diagnosed(
     examined = examine(selection)
     nominal = as_fit(examined.selection, selection.nominal, ())
     wider, gain, verdict = _judged(examined, nominal, validation, rng)
-    if verdict[0] == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
+    if verdict.word == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
         # What was added on the way to no explanation does not predict: it is left out again, and all is judged anew.
         examined = examine(selection.without_causes())
         wider, gain, verdict = _judged(examined, nominal, validation, rng)
     say("measuring the gain", 0.95)
     selection = examined.selection
-    word, causes, alternatives = verdict
-    suspected = tuple(dict.fromkeys([*causes, *(name for group in alternatives for name in group.causes)]))
+    suspected = tuple(dict.fromkeys(name for group in verdict.groups for name in group))
     return Diagnosis(
-        verdict=word,
-        causes=causes,
-        alternatives=alternatives,
+        verdict=verdict.word,
+        causes=causes_of(selection, verdict, examined.chance, wider),
+        alternatives=verdict.alternatives,
         table=table_of(selection),
         extended=wider,
         gain=gain,
         misfit=misfit_of(examined, outliers),
-        excluded=() if word == "unexplained" else excluded_by(selection, suspected),
+        excluded=() if verdict.word == "unexplained" else excluded_by(selection, suspected),
         unseen=unseen_by(selection, suspected),
         innocent=examined.innocent,
+        undecided=examined.undecided,
         missing=remaining_term(examined),
         process_noise=examined.chance,
         integration=selection.integration,

@@ -83,6 +83,7 @@ class Effect:
             a step, by the value at its start.
         says: what it is, in half a sentence.
         settled_by: the experiment or the sensor that tells it from what looks like it.
+        by_record: whether it is a difference between records: its amplitudes are others in every one.
 
     """
 
@@ -94,11 +95,12 @@ class Effect:
     memory: tuple[float, ...] = ()
     says: str = ""
     settled_by: str = ""
+    by_record: bool = False
 
     @property
     def of_run(self) -> bool:
-        """Whether it goes by the clock of a record: its amplitudes then are others in every record."""
-        return "time" in self.needs
+        """Whether it goes by the clock of a record, or by the record: its amplitudes then are others in every one."""
+        return self.by_record or "time" in self.needs
 
     @property
     def harmonic(self) -> bool:
@@ -187,6 +189,15 @@ def length_unit(model: Model) -> str:
     return unit if unit.isalnum() or not unit else f"({unit})"
 
 
+CHANGE = "change_of_"
+"""How the name of an effect begins that a constant of this name is another in every record."""
+
+
+def constant_of(effect: Effect) -> str:
+    """Return the constant at which an effect of that kind acts; its name says which."""
+    return effect.name.removeprefix(CHANGE)
+
+
 def candidates(
     model: Model, bank: Sequence[Effect], contexts: Mapping[str, Collection[str]], observed: Collection[str]
 ) -> tuple[Candidate, ...]:
@@ -230,7 +241,7 @@ def candidates(
     drifting = [] if any(s.kind == "opening" for s in model.signals) else own
     found = []
     for effect in bank:
-        elsewhere = {"parameter": drifting, "constant": [effect.name]}
+        elsewhere = {"parameter": drifting, "constant": [constant_of(effect)]}
         places = elsewhere.get(effect.kind) or [s.name for s in model.signals if takes(effect, s)]
         found += [(effect, place) for place in places]
     places_of: dict[str, set[str]] = {}

@@ -140,7 +140,7 @@ def _hard_limit(side):
 
 STORAGE = (_hard_limit(1.0), _hard_limit(-1.0))
 
-_MEASURE_PRESSURE = "measure the load pressure"
+_MEASURE_PRESSURE = "measure the load, its force or its pressure"
 _TWO_AMPLITUDES = "two amplitudes, and free decay"
 
 FRICTION = (
@@ -169,7 +169,7 @@ LOAD = (
         (amplitude("force", "{value}", _probe),),
         lambda own, context: own["force"],
         says="a constant force on the piston",
-        settled_by=f"half the supply pressure; or {_MEASURE_PRESSURE}",
+        settled_by=f"half the supply, which changes all but a force; or {_MEASURE_PRESSURE}",
     ),
     _load(
         "viscous_friction",

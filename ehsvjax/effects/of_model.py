@@ -1,10 +1,10 @@
-"""Effects that only a model can name: a constant that was given wrong, an input that reaches a sensor by itself."""
+"""Effects that only a model can name: a constant that was given wrong or changed, an input that a sensor shows."""
 
 import functools
 import math
 from collections.abc import Sequence
 
-from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, input_named
+from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, constant, input_named
 from ehsvjax.models.model import Model
 
 _FEEDTHROUGH = "feedthrough_of_"
@@ -23,10 +23,22 @@ def effects_for(model: Model) -> tuple[Effect, ...]:
     )
 
 
+def differences_for(model: Model) -> tuple[Effect, ...]:
+    """Return the candidate causes of what differs between records: each parameter and constant, each sensor's zero."""
+    return (
+        *(_changed(p.name) for p in model.parameters if p.value and not p.certain and "." not in p.name),
+        _zero(),
+    )
+
+
 def effect_of_model(name: str, kind: str, numbers: Sequence[str]) -> Effect | None:
     """Return the effect that `effects_for` gives for some model under that name; None for any other effect."""
     if kind == "sensor" and name.startswith(_FEEDTHROUGH):
         return _feedthrough(name.removeprefix(_FEEDTHROUGH))
+    if kind == "sensor" and name == _zero().name:
+        return _zero()
+    if kind == "constant" and name.startswith(CHANGE):
+        return _changed(name.removeprefix(CHANGE))
     if kind == "constant":
         return next((e for e in (_off(name), _there(name)) if [p.name for p in e.parameters] == list(numbers)), None)
     return None
@@ -74,6 +86,34 @@ def _there(name: str) -> Effect:
         lambda own, value, context: value + own["value"],
         says="a constant of the model is there, and was given as zero",
         settled_by=_settled_by(name),
+    )
+
+
+@functools.cache
+def _changed(name: str) -> Effect:
+    """Return the effect of a parameter that changed between records, the same object for the same name."""
+    return Effect(
+        f"{CHANGE}{name}",
+        "constant",
+        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
+        lambda own, value, context: value * (1.0 + own["error"]),
+        says="a parameter is another in every record",
+        settled_by=f"measure it in every record, and say so: record.at({name}=...)",
+        by_record=True,
+    )
+
+
+@functools.cache
+def _zero() -> Effect:
+    """Return the effect of a sensor whose zero is another in every record."""
+    return Effect(
+        "change_of_zero",
+        "sensor",
+        (amplitude("bias", "{value}", lambda scales: 1e-3 * scales["value"]),),
+        lambda own, y, context: y + own["bias"],
+        says="the sensor's zero is another in every record",
+        settled_by="a gauge of the true zero before every record",
+        by_record=True,
     )
 
 

@@ -21,6 +21,11 @@ def _half_sample(scales: Scales) -> float:
     return 0.5 * scales["sample_period"]
 
 
+def _bent(share: float):
+    """Return the coefficient that bends the largest reading by a share of itself."""
+    return lambda scales: share / max(scales["value"], 1e-300) ** 2
+
+
 def dead_zone(value, half_width):
     """Return what lies beyond +-half_width, less that."""
     return value - jnp.clip(value, -half_width, half_width)
@@ -192,7 +197,7 @@ SENSOR = (
     Effect(
         "sensor_cubic",
         "sensor",
-        (amplitude("coefficient", "1/({value})^2", lambda s: 1e-3 / max(s["value"], 1e-300) ** 2),),
+        (amplitude("coefficient", "1/({value})^2", _bent(1e-3), _bent(-1.0), _bent(1.0)),),
         lambda own, y, context: y + own["coefficient"] * y**3,
         says="the sensor is bent towards its ends",
         settled_by="an external gauge at several levels",

@@ -195,6 +195,15 @@ class Model:
         """What is traced and compiled."""
         return Equations(self.start, self.stepper, self.measure, self.inputs, self.outputs, self.prepare)
 
+    @property
+    def of_run(self) -> dict[str, float]:
+        """Numbers of its effects that go by a record's clock, with the values at which they are absent in others."""
+        return {
+            candidate.parameter(number.name): number.absent
+            for layer in self.layers for candidate in layer if candidate.effect.of_run
+            for number in candidate.effect.parameters if number.absent is not None
+        }  # fmt: skip
+
     def parameter(self, name: str) -> Parameter:
         """Return the parameter, constant or initial condition of that name.
 

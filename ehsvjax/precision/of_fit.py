@@ -114,7 +114,7 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
             spread = deviations(found, covariance)[i, : len(record)]
             return _bands(of.problem.observed, spread, noise, factor, quantile)
     problem = _problem(fit, [record.select(outputs=names)], [start])
-    values = [fit.parameters[name] for name in problem.free] + [start[name] for name in problem.free_initial]
+    values = [fit.parameters_of(record)[name] for name in problem.free] + [start[name] for name in problem.free_initial]
     new = sensitivities(problem, np.array(values))
     warn_of_failure(fit.model, record, {name: new.simulated[0, :, i] for i, name in enumerate(problem.observed)})
     count = len(new.names)

@@ -82,11 +82,22 @@ class Noise(NamedTuple):
         if not all(map(np.isfinite, squares)):
             return 0.0 if squares[0] == squares[1] else squares[0] - squares[1]
         best, change = both[int(np.argmin(squares))], both[0] - both[1]
-        square = float(change @ change)
-        if not square > 0.0:
+        if not change.any():
             return 0.0
-        between_parts = float(np.sum(np.bincount(self._part_of, change * best) ** 2)) / square
-        return (squares[0] - squares[1]) / max(self.along(change), between_parts)
+        return (squares[0] - squares[1]) / self.left_along(change, best)
+
+    def left_along(self, direction: Float[np.ndarray, " sample"], left: Float[np.ndarray, " sample"]) -> float:
+        """Return the variance of what an explanation leaves, along a direction; both of scaled readings.
+
+        That of the noise, or, if it is more, as it differs from part to part of the records.
+        """
+        between_parts = float(np.sum(np.bincount(self._part_of, direction * left) ** 2)) / float(direction @ direction)
+        return max(self.along(direction), between_parts)
+
+    def of_record(self, record: int) -> "Noise":
+        """Return the noise with the readings of one record alone."""
+        there = np.arange(len(self.measured)) == record
+        return self._replace(measured=self.measured & there[:, None, None])
 
     def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
         """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""

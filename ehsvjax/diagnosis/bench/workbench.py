@@ -19,7 +19,7 @@ from ehsvjax import arithmetic
 from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates, input_named
 from ehsvjax.effects.extended import disturbance, effects_in_the_loop, extended, switch
 from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
-from ehsvjax.effects.of_model import effects_for
+from ehsvjax.effects.of_model import differences_for, effects_for
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import Problem, cast, observed_outputs, simulated, to_unit, to_values
@@ -110,6 +110,10 @@ class Workbench:
     def columns_with(self, included: Sequence[int]) -> list[int]:
         """Columns of the nominal model's unknowns and of some candidates' numbers, by their positions."""
         return [*self.base_columns, *(j for i in included for j in self.columns_of(self.candidates[i]))]
+
+    def of_each(self, candidate: int) -> bool:
+        """Whether a candidate, by its position, is something that each of several records has for itself."""
+        return len(self.records) > 1 and self.candidates[candidate].effect.of_run
 
     def numbers_of(self, candidate: int) -> int:
         """How many numbers the effect of a candidate has."""
@@ -264,7 +268,9 @@ def _bench(
     """Return the bench before its step is settled, with the probes that are known."""
     model = fit.model
     observed = observed_outputs(model, records)
-    found = candidates(model, (*bank, *effects_for(model)), internal.contexts, observed)
+    # A single record differs from none.
+    own = (*effects_for(model), *(differences_for(model) if len(records) > 1 else ()))
+    found = candidates(model, (*bank, *own), internal.contexts, observed)
     places = tuple(s.name for s in model.signals if s.kind in PLACES and s.name in internal.values)
     probes = {place: _probe(internal.values[place]) for place in places} | dict(probes)
     forces = [s.name for s in model.signals if s.kind in ("force", "load") and s.name in places]

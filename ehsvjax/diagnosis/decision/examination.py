@@ -1,17 +1,18 @@
 """What the causes that were found leave: is it innocent, is it chance, does the bank lack what is missing?"""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
-from ehsvjax.diagnosis.bench.significance import INSEPARABLE
-from ehsvjax.diagnosis.decision.search import SIGNIFICANT, Selection
-from ehsvjax.diagnosis.hypotheses.curves import Terms, terms_at
+from ehsvjax.diagnosis.bench.evidence import CONVINCING, INSEPARABLE, SIGNIFICANT
+from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.decision.prediction import predicted
+from ehsvjax.diagnosis.decision.repeats import repeats_itself
+from ehsvjax.diagnosis.decision.search import Selection, noise_of_all_left
+from ehsvjax.diagnosis.hypotheses.curves import terms_at
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence, dependences
-from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term
-from ehsvjax.diagnosis.hypotheses.process_noise import CONVINCING, ProcessNoise, process_noise
+from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term, told_by
+from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise, process_noise
 
 # Dependences that are followed up where something is left.
 _SUSPECTS = 8
@@ -25,8 +26,9 @@ class Examination(NamedTuple):
         before: what the nominal model's residual depends on, the most significant first.
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
+        undecided: whether it is nothing if all that is left is noise: one record does not tell.
         chance: the random force that explains the nominal model's residual better than any cause; None if none does.
-        or_chance: whether a random force explains it about as well as all causes together.
+        chance_behind: noise variances by which a random force explains it worse than all causes together.
         instead: one term of free form that explains the record as well as all causes together, but for the price of
             its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -37,8 +39,9 @@ class Examination(NamedTuple):
     before: tuple[Dependence, ...]
     after: tuple[Dependence, ...]
     innocent: bool
+    undecided: bool
     chance: ProcessNoise | None
-    or_chance: bool
+    chance_behind: float
     instead: MissingTerm | None
     lacking: bool
 
@@ -52,13 +55,21 @@ def examine(selection: Selection) -> Examination:
     if selection.included:
         terms = terms_at(bench, selection.final.points[0], selection.seen)
         after = dependences(selection.final, noise, terms)
-    innocent = not _depends(selection, after, terms)
-    chance, or_chance = _random_force(selection, before, innocent)
+    # Noise that is seen outside all responses excuses what lies along them. An autoregression of all that is left takes
+    # any slow misfit for its own: it does so only if the experiment was repeated and left something else.
+    undecided = False
+    if _significant(after):
+        everything = noise_of_all_left(bench, selection.final)
+        undecided = everything.coloured and not _significant(dependences(selection.final, everything, terms))
+    repeated = repeats_itself(bench, selection.final.residual[0], noise) if undecided else None
+    innocent = repeated is False or not _significant(after)
+    chance, chance_behind = _random_force(selection, before, innocent)
     if chance is not None:
         selection, after, innocent = selection.without_causes(), before, True
-    if innocent:
-        selection = replace(selection, noise=_own_noise(selection))
-    return Examination(selection, before, after, innocent, chance, or_chance, *_instead(selection, before, innocent))
+    instead = _instead(selection, before, innocent)
+    return Examination(
+        selection, before, after, innocent, undecided and repeated is None, chance, chance_behind, *instead
+    )  # fmt: skip
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
@@ -66,9 +77,15 @@ def remaining_term(examined: Examination) -> MissingTerm | None:
     if examined.innocent or examined.lacking:
         return examined.instead
     selection = examined.selection
-    return missing_term(
+    term, _ = missing_term(
         selection.bench, selection.final, selection.noise, selection.seen, _suspects(examined.after)
     )  # fmt: skip
+    return term
+
+
+def _significant(tests: tuple[Dependence, ...]) -> bool:
+    """Whether what is left depends on something."""
+    return bool(tests) and tests[0].corrected < SIGNIFICANT
 
 
 def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
@@ -77,63 +94,56 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
     return (*tests[:_SUSPECTS], *at_home)
 
 
-def _depends(selection: Selection, tests: tuple[Dependence, ...], terms: Terms) -> bool:
-    """Whether what is left depends on something, also if it is itself taken for coloured noise."""
-    # Where nothing that a term could do would show, nothing can be told from noise.
-    if not tests or tests[0].corrected >= SIGNIFICANT:
-        return False
-    own = _own_noise(selection)
-    if not own.coloured:
-        return True
-    again = dependences(selection.final, own, terms)
-    return bool(again) and again[0].corrected < SIGNIFICANT
-
-
-def _own_noise(selection: Selection) -> Noise:
-    """Return the noise if all that is left is noise."""
-    final = selection.final
-    return noise_outside(final.residual[0], selection.bench.problem.samples.measured, final.slopes[0])
-
-
 def _random_force(
     selection: Selection, before: tuple[Dependence, ...], innocent: bool
-) -> tuple[ProcessNoise | None, bool]:
+) -> tuple[ProcessNoise | None, float]:
     """Return the random force that explains the nominal model's residual better than any cause, if there is one.
 
-    What the causes seemed to explain was then the motion that the force had left behind. And whether a random force
-    explains it about as well as they do.
+    What the causes seemed to explain was then the motion that the force had left behind. And by how much it explains it
+    worse than they do.
     """
     bench = selection.bench
     nominal = process_noise(bench, selection.nominal, selection.noise)
     if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
-        return None, False
+        return None, np.inf
+    repeated = repeats_itself(bench, selection.nominal.residual[0], selection.noise)
+    if repeated:
+        return None, np.inf
+    behind = -np.inf
     if selection.included:
         final = process_noise(bench, selection.final, selection.noise)
         # Where no force shows any more, the causes have made it invisible.
-        better = -np.inf if final is None else nominal.likelihood - final.of_sensor + _least_price(selection)
+        behind = np.inf if final is None else final.of_sensor - nominal.likelihood - _least_price(selection)
         # A single cause that leaves nothing unexplained has the first word.
         single = innocent and len(selection.included) == 1
-        if not better > (CONVINCING if single else INSEPARABLE):
-            return None, bool(better > -INSEPARABLE)
-    if before and before[0].corrected < SIGNIFICANT:
+        if not behind < -(CONVINCING if single else INSEPARABLE):
+            return None, behind
+    if _significant(before):
         # A term that depends on what runs along the model is a better reason than chance.
-        term = missing_term(bench, selection.nominal, selection.noise, selection.seen, _suspects(before))
+        term, _ = missing_term(bench, selection.nominal, selection.noise, selection.seen, _suspects(before))
         if _likelihood(selection.noise, term) > nominal.likelihood:
-            return None, False
-    return nominal, False
+            return None, np.inf
+    return nominal._replace(settled=repeated is False), behind
 
 
 def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
-    """Return a term of free form that explains the record as well as all causes together, and whether better."""
+    """Return a term of free form that explains the record as well as all causes together, and whether better.
+
+    Like a cause, it is not better if unused data are predicted better without it: with the causes.
+    """
     causes = selection.included
     if not before or not causes or (innocent and len(causes) == 1):
         return None, False
-    noise = selection.noise
-    term = missing_term(selection.bench, selection.nominal, noise, selection.seen, _suspects(before))
+    bench, noise, nominal = selection.bench, selection.noise, selection.nominal
+    term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
     price = float(np.log(noise.measured.sum()))
     better = noise.gained(selection.final.residual[0], term.residual)
     better += price * sum(_numbers(selection, i) for i in causes)
-    return (term if better > -INSEPARABLE else None), bool(better > price * term.pieces)
+    if not better > price * term.pieces:
+        return (term if better > -INSEPARABLE else None), False
+    unused = predicted(bench, [()], nominal.points, noise, lambda known: told_by(bench, nominal, known, curve))
+    contradicted = unused.noise.gained(unused.residual[0], selection.unused.residual[0])
+    return term, bool(contradicted < INSEPARABLE)
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:

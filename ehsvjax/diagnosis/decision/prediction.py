@@ -1,6 +1,6 @@
 """What sets of causes predict of data that they were not fitted to: each record from the others, or its own past."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ def predicted(
     sets: Sequence[Sequence[int]],
     starts: Float[np.ndarray, "set parameter"],
     noise: Noise,
+    told: Callable[[Noise], Workbench] | None = None,
 ) -> Predicted:
     """Refit sets of causes to some of the readings, and return what they leave of the others.
 
@@ -43,34 +44,37 @@ def predicted(
         sets: positions of the effects of each.
         starts: of each.
         noise: of what is left.
+        told: what the readings of a noise tell of a term that acts besides, as a bench with it; by default none acts.
 
     """
+
+    def refitted(used: Bool[np.ndarray, "record time signal"]) -> tuple[Workbench, Refits]:
+        known = noise._replace(measured=noise.measured & used)
+        acting = bench if told is None else told(known)
+        return acting, refit(acting, starts, columns, known, race=False)
+
     own = [bench.columns_with(some) for some in sets]
     columns = padded(own, max(map(len, own)))
     if len(bench.records) == 1:
         counted = np.cumsum(noise.measured[0].sum(axis=-1))
         later = np.zeros_like(noise.measured)
         later[:, int(np.searchsorted(counted, (1.0 - HELD_BACK) * counted[-1])) :] = True
-        found = _refitted(bench, starts, columns, noise, ~later)
-        return Predicted(found.residual, noise._replace(measured=noise.measured & later))
+        return Predicted(refitted(~later)[1].residual, noise._replace(measured=noise.measured & later))
     residual = np.empty((len(sets), *noise.measured.shape))
     for k in range(len(bench.records)):
         this = np.zeros_like(noise.measured)
         this[k] = True
-        residual[:, k] = _left_out(bench, k, _refitted(bench, starts, columns, noise, ~this), this, noise)[:, k]
+        residual[:, k] = _left_out(*refitted(~this), k, noise)[:, k]
     return Predicted(residual, noise)
 
 
-def _refitted(bench: Workbench, starts, columns, noise: Noise, used: Bool[np.ndarray, "record time signal"]) -> Refits:
-    return refit(bench, starts, columns, noise._replace(measured=noise.measured & used), race=False)
-
-
 def _left_out(
-    bench: Workbench, record: int, others: Refits, this: Bool[np.ndarray, "record time signal"], noise: Noise
+    bench: Workbench, others: Refits, record: int, noise: Noise
 ) -> Float[np.ndarray, "set record time signal"]:
     """Return the residuals of a record that was left out, its initial conditions refitted to it."""
     points = others.points.copy()
     of_record = [j for j, name in enumerate(bench.problem.names) if name.endswith(f"[{record}]")]
     initial = [j for j in of_record if j in bench.base_columns]
     points[:, of_record] = np.where(np.isin(of_record, initial), points[:, of_record], bench.nominal[of_record])
-    return _refitted(bench, points, padded([initial] * len(points), max(len(initial), 1)), noise, this).residual
+    chosen = padded([initial] * len(points), max(len(initial), 1))
+    return refit(bench, points, chosen, noise.of_record(record), race=False).residual

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnosis.bench.evidence import PER_NUMBER
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
-from ehsvjax.diagnosis.bench.significance import INSEPARABLE
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
@@ -21,8 +21,6 @@ from ehsvjax.diagnosis.decision.trials import (
 )
 from ehsvjax.diagnosis.hypotheses.screening import Screened, responses_at, screen
 
-PER_NUMBER = 4.0
-"""Likelihood that each number of an effect must bring, so that more numbers are no advantage."""
 _SWAPS = 3
 # Noise variances by which a refit has to be better than another to take its place.
 _LOWER = 0.1
@@ -46,11 +44,6 @@ class Rival(NamedTuple):
     candidate: int
     deficit: float
     refitted: Refits
-
-
-def inseparable(group: Sequence[Rival]) -> tuple[Rival, ...]:
-    """Return those of an effect's rivals that a record cannot tell from the best."""
-    return tuple(rival for rival in group if rival.deficit < INSEPARABLE)
 
 
 def rivals_of_all(
@@ -151,7 +144,9 @@ def _refitted_from(
     """
     bench = trials.bench
     screening = screen(bench, base, responses_at(bench, base, rest, noise, trials.parts), noise, 1)
-    close = [s for s in _close(screening.ranked, own) if fits(bench, (*rest, s.candidate))]
+    # What all records share is no worse an explanation for what each could have for itself.
+    able = [s for s in screening.ranked if bench.of_each(own) or not bench.of_each(s.candidate)]
+    close = [s for s in _close(able, own) if fits(bench, (*rest, s.candidate))]
     if not close:
         return {}
     refitted = refit_screened(trials, close, rest, noise, base, [with_it])

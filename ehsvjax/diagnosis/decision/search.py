@@ -8,14 +8,14 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits
-from ehsvjax.diagnosis.bench.significance import INSEPARABLE
 from ehsvjax.diagnosis.bench.workbench import Workbench, prepared, settled
-from ehsvjax.diagnosis.decision.prediction import predicted
-from ehsvjax.diagnosis.decision.rivals import PER_NUMBER, Rival, price, rivals_again, rivals_of_all
+from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
+from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -26,10 +26,8 @@ from ehsvjax.diagnosis.decision.trials import (
     trials_of,
     without,
 )
-from ehsvjax.diagnosis.hypotheses.screening import Screening, responses_at, screen
+from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, responses_at, screen
 
-SIGNIFICANT = 0.002
-"""Corrected p-value of the whole search below which an effect is taken to be there."""
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
 _ROUNDS = 6
@@ -66,6 +64,21 @@ class Integration(NamedTuple):
     worth: float
 
 
+class Need(NamedTuple):
+    """How much worse the fit is without an effect, everything else refitted, in variances of what is left.
+
+    Attributes:
+        gain: of all records; the least by noise as it is seen outside all responses, and as all that is left would be.
+        of_record: of each in turn; negative where it would do better without.
+        required: what chance would gain with it, after the search that found it.
+
+    """
+
+    gain: float
+    of_record: tuple[float, ...]
+    required: float
+
+
 @dataclass(frozen=True, eq=False)
 class Selection:
     """What the search came to.
@@ -78,7 +91,8 @@ class Selection:
         noise: the noise of what is left.
         stages: the looks, the first at the nominal model.
         rivals: for each included effect all that were refitted in its place, the best, itself, first.
-        gains: for each included effect how much worse the fit is without it, as `Noise.gained` counts.
+        needs: for each included effect what the fit needs it for.
+        unused: what is left of data that were not used: with all effects, without each of them in turn, without any.
         integration: how all was simulated.
 
     """
@@ -90,7 +104,8 @@ class Selection:
     noise: Noise
     stages: tuple[Stage, ...]
     rivals: tuple[tuple[Rival, ...], ...]
-    gains: tuple[float, ...]
+    needs: tuple["Need", ...]
+    unused: Predicted
     integration: Integration
 
     @property
@@ -105,7 +120,8 @@ class Selection:
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
-        return replace(self, included=(), final=self.nominal, rivals=(), gains=())
+        unused = self.unused._replace(residual=self.unused.residual[-1:])
+        return replace(self, included=(), final=self.nominal, rivals=(), needs=(), unused=unused)
 
 
 def select(bench: Workbench, progress: Progress) -> Selection:
@@ -146,7 +162,8 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         noise=last.noise,
         stages=(*stages, last),
         rivals=weighed.rivals,
-        gains=weighed.gains,
+        needs=weighed.needs,
+        unused=weighed.unused,
         integration=_integration(begun, last.trials.bench, weighed.worth),
     )
 
@@ -158,7 +175,8 @@ class _Weighed(NamedTuple):
         stage: with the causes after swaps for better rivals, at the step that all that is compared needs.
         nominal: the refit without any, under the same noise.
         rivals: for each cause all that was refitted in its place, the best first.
-        gains: for each cause how much worse the fit is without it, as `Noise.gained` counts.
+        needs: for each cause what the fit needs it for.
+        unused: what is left of unused data with all causes, without each of them, and without any.
         needless: the cause that is needed least, if the record can do without it.
         worth: noise variances by which halving the step changes the difference of any two of them.
 
@@ -167,7 +185,8 @@ class _Weighed(NamedTuple):
     stage: Stage
     nominal: Refits
     rivals: tuple[tuple[Rival, ...], ...]
-    gains: tuple[float, ...]
+    needs: tuple[Need, ...]
+    unused: Predicted
     needless: int | None
     worth: float
 
@@ -187,8 +206,8 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
         stage = _look(trials._replace(bench=known), included, final, noise)
         looked_at = set(included)
         included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
-    gains, needless = _gains(stage, nominal)
-    return _Weighed(stage, nominal, rivals, gains, needless, worth)
+    needs, unused = _needs(stage, nominal)
+    return _Weighed(stage, nominal, rivals, needs, unused, _needless(included, needs, unused), worth)
 
 
 def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
@@ -278,8 +297,15 @@ def _next_effect(stage: Stage) -> Stage | None:
     hopeful = [
         s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
     ]
-    if not hopeful:
-        return None
+    # What each record has for itself explains anything that differs between them: what all share comes first.
+    shared = [s for s in hopeful if not bench.of_each(s.candidate)]
+    return _best_of(stage, shared) or _best_of(stage, [s for s in hopeful if bench.of_each(s.candidate)])
+
+
+def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
+    """Return the next look with the one of some effects that explains most, or none if none gains enough."""
+    trials = stage.trials
+    bench = trials.bench
     best: Stage | None = None
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
@@ -320,27 +346,44 @@ def _cost_under(refits: Refits, noise: Noise) -> float:
     return float(np.sum(noise.scaled(refits.residual[0]) ** 2))
 
 
-def _gains(stage: Stage, nominal: Refits) -> tuple[tuple[float, ...], int | None]:
-    """Return how much worse the fit is without each effect, and the one that is needed least, if it is needless.
-
-    It is if it gains less than chance could, or if data that were not used are predicted better without it by more
-    than chance.
-    """
+def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
+    """Return what the fit needs each effect for, and what is left of unused data; see `Selection.unused`."""
     trials, final, noise = stage.trials, stage.current, stage.noise
-    if not stage.included:
-        return (), None
-    sets, points, gains = [stage.included], [final.points[0]], []
+    # All that is left may be chance as well: what a cause explains must stand out from that too.
+    every_noise = noise, noise_of_all_left(trials.bench, final)
+    sets, points, needs = [stage.included], [final.points[0]], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
         refitted = refit_set(trials, start, rest, noise)
         sets.append(rest)
         points.append(refitted.points[0])
-        gains.append(noise.gained(refitted.residual[0], final.residual[0]))
-    unused = predicted(trials.bench, sets, np.stack(points), noise)
+        both = refitted.residual[0], final.residual[0]
+        needs.append(Need(
+            gain=min(one.gained(*both) for one in every_noise),
+            of_record=tuple(noise.of_record(k).gained(*both) for k in range(len(trials.bench.records))),
+            required=required_gain(trials.bench, stage.screening, i),
+        ))  # fmt: skip
+    if len(stage.included) > 1:
+        sets.append(())
+        points.append(nominal.points[0])
+    return tuple(needs), predicted(trials.bench, sets, np.stack(points), noise)
+
+
+def noise_of_all_left(bench: Workbench, final: Refits) -> Noise:
+    """Return the noise of a refit's residual, if all that is left of it is noise."""
+    return noise_outside(final.residual[0], bench.problem.samples.measured, final.slopes[0])
+
+
+def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted) -> int | None:
+    """Return the effect that is needed least, if it is needless; None if all are needed.
+
+    It is needless if it gains less than chance could, or if data that were not used are predicted better without it
+    by more than chance.
+    """
     spare = {}
-    for i, gain, rest_predicts in zip(stage.included, gains, unused.residual[1:], strict=True):
+    for i, need, rest_predicts in zip(included, needs, unused.residual[1:], strict=False):
         contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
-        spare[i] = min(gain - required_gain(trials.bench, stage.screening, i), INSEPARABLE - contradicted)
-    least = min(spare, key=lambda i: spare[i])
-    return tuple(gains), least if spare[least] < 0.0 else None
+        spare[i] = min(need.gain - need.required, INSEPARABLE - contradicted)
+    least = min(spare, key=lambda i: spare[i], default=None)
+    return least if least is not None and spare[least] < 0.0 else None

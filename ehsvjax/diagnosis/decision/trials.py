@@ -11,7 +11,7 @@ from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, padded, refit, span
-from ehsvjax.diagnosis.bench.workbench import Workbench
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.diagnosis.hypotheses.curves import Terms, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import parts_of
 from ehsvjax.diagnosis.hypotheses.screening import Screened
@@ -166,18 +166,28 @@ def _most_promising(
 ) -> Float[np.ndarray, "individual parameter"]:
     """Return of each list of points the one that would fit best after a linear refit of what `current` has.
 
-    Where an effect does nothing, as a limit that is never reached, no derivative leads on.
+    With that refit, where it fits better so: a start that is far off as it stands would be given up in a race. Where an
+    effect does nothing, as a limit that is never reached, no derivative leads on.
     """
     points = np.concatenate([current.points[:1], *(np.stack(choice) for choice in choices)])
     without_it, *outputs = bench.simulated(points)
     acts = np.array([not np.array_equal(with_it, without_it) for with_it in outputs])
     r = noise.scaled(bench.problem.samples.outputs - np.stack(outputs))
-    known = span(noise.scaled(current.slopes[0]))
-    r = r - (r @ known) @ known.T
-    cost = np.sum(r**2, axis=1)
+    jacobian = noise.scaled(current.slopes[0])
+    known = span(jacobian)
+    cost = np.sum((r - (r @ known) @ known.T) ** 2, axis=1)
     cost = np.where(np.isfinite(cost) & acts, cost, np.inf)
-    edges = np.cumsum([1, *(len(choice) for choice in choices)])
-    return np.stack([points[a + np.argmin(cost[a - 1 : b - 1])] for a, b in itertools.pairwise(edges)])
+    edges = np.cumsum([0, *(len(choice) for choice in choices)])
+    best = np.array([a + np.argmin(cost[a:b]) for a, b in itertools.pairwise(edges)])
+    as_they_are, refitted = points[1 + best], points[1 + best]
+    columns = current.chosen[0][current.chosen[0] >= 0]
+    lower, upper = bounds_of(bench)
+    finite = np.where(np.isfinite(r[best]), r[best], 0.0)
+    steps = np.linalg.lstsq(jacobian[: len(columns)].T, finite.T, rcond=TOLD_APART)[0].T
+    refitted[:, columns] = np.clip(refitted[:, columns] + steps, lower[columns], upper[columns])
+    left = np.sum(noise.scaled(bench.problem.samples.outputs - bench.simulated(refitted)) ** 2, axis=1)
+    better = np.isfinite(left) & ~(left >= np.sum(r[best] ** 2, axis=1))
+    return np.where(better[:, None], refitted, as_they_are)
 
 
 def _grown(

@@ -4,46 +4,100 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, probabilities
 from ehsvjax.diagnosis.bench.readings import lattice
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.examination import Examination
-from ehsvjax.diagnosis.decision.rivals import Rival, inseparable
-from ehsvjax.diagnosis.decision.search import Selection
+from ehsvjax.diagnosis.decision.search import Need, Selection
+from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 
 QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"
+UNKNOWN = "unknown_term"
+"""What no effect of the bank is: in one record it may look like chance."""
 # Step of the readings' lattice, in deviations of the other noise, beyond which it is a cause.
 _COARSEST = 2.2
 
 
 class Alternative(NamedTuple):
-    """Causes that a record cannot tell apart, the best first, and what would: an experiment or a sensor."""
+    """Causes that a record cannot tell apart, the best first, and what would: an experiment or a sensor.
+
+    `probabilities` are those of the causes in turn; what is left to one is that of nothing, or of any other.
+    """
 
     causes: tuple[str, ...]
     settled_by: str
+    probabilities: tuple[float, ...]
 
 
-def verdict_of(examined: Examination) -> tuple[str, tuple[str, ...], tuple[Alternative, ...]]:
-    """Return the verdict, the causes and the alternatives."""
-    selection = examined.selection
-    groups = [
-        _names(selection, inseparable(selection.rivals[k])) for k in np.argsort([-gain for gain in selection.gains])
-    ]
+class Verdict(NamedTuple):
+    """What is said, and of what.
+
+    Attributes:
+        word: "adequate", "named", "ambiguous" or "unexplained".
+        groups: for each cause all that could be there instead, itself first: name -> probability; what gains most
+            first. A cause that is alone is one that the records tell from all others.
+        included: position of the effect of each group; None for what is no effect of the bank.
+        alternatives: the groups of more than one.
+
+    """
+
+    word: str
+    groups: tuple[dict[str, float], ...]
+    included: tuple[int | None, ...]
+    alternatives: tuple[Alternative, ...]
+
+
+def verdict_of(examined: Examination) -> Verdict:
+    """Return the verdict, with the causes and what could be there instead."""
+    selection, bench = examined.selection, examined.selection.bench
+    order = np.argsort([-need.gain for need in selection.needs]).tolist()
+    groups = [_group(examined, k) for k in order]
     if examined.lacking or not (examined.innocent or groups):
-        return "unexplained", (), ()
-    causes = tuple(group[0] for group in groups) + _quantised(selection)
-    causes += (PROCESS_NOISE,) if examined.chance else ()
-    if not causes:
-        return "adequate", (), ()
-    if examined.or_chance:
-        # Instead of them all.
-        groups = [(*group, PROCESS_NOISE) for group in groups]
-    alternatives = tuple(Alternative(g, _settled_by(selection.bench, g)) for g in groups if len(g) > 1)
-    return ("ambiguous" if alternatives else "named"), causes, alternatives
+        return Verdict("unexplained", (), (), ())
+    others = [{name: 1.0} for name in _quantised(selection)]
+    others += [_chance(examined.chance, examined.chance_behind)] if examined.chance else []
+    included = (*(selection.included[k] for k in order), *(None for _ in others))
+    every = (*groups, *others)
+    if not every:
+        return Verdict("adequate", (), (), ())
+    alternatives = tuple(
+        Alternative(tuple(g), _settled_by(bench, tuple(g)), tuple(g.values())) for g in every if len(g) > 1
+    )
+    return Verdict("ambiguous" if alternatives else "named", every, included, alternatives)
 
 
-def _names(selection: Selection, group: tuple[Rival, ...]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(selection.bench.candidates[r.candidate].name for r in group))
+def _group(examined: Examination, k: int) -> dict[str, float]:
+    """Return what could be there as one of the causes, the best first, with probabilities.
+
+    Against each other, against a random force in the place of them all, and against nothing.
+    """
+    selection = examined.selection
+    rivals, need = selection.rivals[k], selection.needs[k]
+    deficits = [rival.deficit for rival in rivals]
+    every = probabilities([*deficits, examined.chance_behind, _nothing_behind(need)])
+    found: dict[str, float] = {}
+    for rival, probable in zip(rivals, every, strict=False):
+        name = selection.bench.candidates[rival.candidate].name
+        if rival.deficit < INSEPARABLE:
+            found[name] = found.get(name, 0.0) + float(probable)
+    if examined.chance_behind < INSEPARABLE:
+        found[PROCESS_NOISE] = float(every[len(rivals)])
+    return found
+
+
+def _nothing_behind(need: Need) -> float:
+    """Return by how much nothing at all explains the records worse than a cause does, its search paid."""
+    return need.gain - need.required
+
+
+def _chance(chance: ProcessNoise, behind: float) -> dict[str, float]:
+    """Return how probable a random force is against the causes that it was found in the place of.
+
+    Unless the experiment was repeated, nothing speaks for it against a term that the bank lacks.
+    """
+    probable = float(probabilities([0.0, -behind])[0])
+    return {PROCESS_NOISE: probable} if chance.settled else {PROCESS_NOISE: probable / 2.0, UNKNOWN: probable / 2.0}
 
 
 def _quantised(selection: Selection) -> tuple[str, ...]:

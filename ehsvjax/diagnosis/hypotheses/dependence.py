@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnosis.bench.evidence import corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, unexplained
-from ehsvjax.diagnosis.bench.significance import corrected, smallest_p_values
 from ehsvjax.diagnosis.hypotheses.curves import Curve, Terms, single_waves, waves_in
 
 

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, refit, span, unexplained
-from ehsvjax.diagnosis.bench.significance import INSEPARABLE
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.hypotheses.curves import (
     TIME,
@@ -89,8 +89,10 @@ def missing_term(
     noise: Noise,
     seen: Mapping[str, Float[np.ndarray, "record time"]],
     suspects: Sequence[Dependence],
-) -> MissingTerm:
+) -> tuple[MissingTerm, Curve]:
     """Estimate the term that takes most of what is left, at the place and along the quantity that explain most.
+
+    Returns it, and the curve of which it is made.
 
     Each suspect is estimated, put into the simulation, and estimated again, for a large term is not linear. Those for
     which there is most evidence are drawn with many pieces. Some make the same record by algebra (a load that depends
@@ -133,7 +135,7 @@ def missing_term(
     variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - best.left - smooth.pieces
-    return MissingTerm(
+    found = MissingTerm(
         place=place,
         unit="" if curve.relative else bench.fit.model.unit(place),
         quantity=quantity,
@@ -149,6 +151,13 @@ def missing_term(
         residual=best.residual,
         alike=tuple(other for other in others if other != (place, quantity)),
     )
+    return found, curve
+
+
+def told_by(bench: Workbench, final: Refits, noise: Noise, curve: Curve) -> Workbench:
+    """Return the bench with a curve that acts as the readings of this noise tell it, and no others."""
+    drawn = _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.pieces)))
+    return bench_with(bench, curve, drawn.smooth.coefficients)
 
 
 def _least(term, free) -> Float[np.ndarray, " line"]:

@@ -16,21 +16,25 @@ from ehsvjax.diagnosis.bench.refits import Refits, span
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.precision.residual_noise import residual_noise
 
-CONVINCING = 20.0
-"""Twice the log-likelihood by which a force must explain a residual better than the noise of a sensor."""
-
 
 class ProcessNoise(NamedTuple):
     """A random force: at which signal, its spectral density, unit^2 s, and how well it explains the residual.
 
-    `likelihood` is twice the logarithm with the random force and white noise of the sensor, `of_sensor` that of the
-    best noise of the sensor alone, white or correlated.
+    Attributes:
+        place: signal at which it acts.
+        intensity: its spectral density.
+        likelihood: twice the logarithm with the random force and white noise of the sensor.
+        of_sensor: the same with the best noise of the sensor alone, white or correlated.
+        settled: whether a repeat of the experiment left something else: without one, nothing tells chance from a term
+            that the bank lacks.
+
     """
 
     place: str
     intensity: float
     likelihood: float
     of_sensor: float
+    settled: bool = False
 
 
 def process_noise(bench: Workbench, final: Refits, noise: Noise) -> ProcessNoise | None:

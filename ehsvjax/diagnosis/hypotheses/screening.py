@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnosis.bench.evidence import corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, unexplained
-from ehsvjax.diagnosis.bench.significance import corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.hypotheses.harmonics import with_frequencies
 from ehsvjax.effects.effect import UNLIMITED, Candidate

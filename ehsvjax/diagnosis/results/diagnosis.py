@@ -9,6 +9,7 @@ from ehsvjax.diagnosis.decision.search import Integration
 from ehsvjax.diagnosis.decision.verdict import Alternative
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
+from ehsvjax.diagnosis.results.causes import Cause, Left, names_of
 from ehsvjax.diagnosis.results.gain import Gain
 from ehsvjax.diagnosis.results.misfit import Misfit
 from ehsvjax.effects import BANK
@@ -35,7 +36,8 @@ class Diagnosis:
 
     Attributes:
         verdict: "adequate", "named", "ambiguous" or "unexplained".
-        causes: names of the effects that are missing in the model, best first; empty unless named or ambiguous.
+        causes: what is missing in the model, what gains most first: how sure, how large, which share of the misfit;
+            empty unless named or ambiguous. `names` has their names.
         alternatives: for each cause that is not alone: all that could be there instead, itself among them.
         table: every candidate: signal, size, unit, score, p-values, likelihood gain, smallest size that the record
             could have shown, and what it is confounded with.
@@ -45,6 +47,7 @@ class Diagnosis:
         excluded: effects that the record excludes, above which size.
         unseen: effects that the record cannot show at all, whatever their size.
         innocent: whether what the extended model leaves depends on nothing any more.
+        undecided: whether it may be chance all the same, slow noise or a disturbance: only a repeat tells.
         missing: where something is left, the term that is missing, estimated without a form; where several causes
             were found, the one term that would explain the record as well, if there is one.
         process_noise: the random force that was found, if it is the cause.
@@ -55,7 +58,7 @@ class Diagnosis:
     """
 
     verdict: str
-    causes: tuple[str, ...]
+    causes: tuple[Cause, ...]
     alternatives: tuple[Alternative, ...]
     table: "pandas.DataFrame"
     extended: Fit
@@ -64,6 +67,7 @@ class Diagnosis:
     excluded: tuple[Excluded, ...]
     unseen: tuple[str, ...]
     innocent: bool
+    undecided: bool
     missing: MissingTerm | None
     process_noise: ProcessNoise | None
     integration: Integration
@@ -74,6 +78,22 @@ class Diagnosis:
     def record(self) -> Record:
         """The first of the records."""
         return self.records[0]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the causes."""
+        return names_of(self.causes)
+
+    @property
+    def left(self) -> Left:
+        """What no cause explains: how much of it, where it shows, along what; see `missing` for its form."""
+        test = None if self.innocent or not self.misfit.tests_after else self.misfit.tests_after[0]
+        place, quantity, p_value = (None, None, 1.0) if test is None else (test.place, test.quantity, test.corrected)
+        share, *by_record = (
+            {name: 1.0 - g.share_removed for name, g in outputs.items()}
+            for outputs in (self.gain.outputs, *self.gain.by_record)
+        )
+        return Left(share, tuple(by_record), self.innocent, place, quantity, p_value)
 
     def __str__(self) -> str:
         """Return the diagnosis in a few sentences."""

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnosis.decision.prediction import HELD_BACK, Predicted, predicted
+from ehsvjax.diagnosis.decision.prediction import HELD_BACK
 from ehsvjax.diagnosis.decision.search import Selection
 from ehsvjax.fit import Fit
 from ehsvjax.record import Record
@@ -76,13 +76,13 @@ def gain_of(
         judged = [_validated(selection, nominal, extended, record) for record in validation]
         on = f"{', '.join(names)}, which {'was' if len(names) == 1 else 'were'} not used"
     else:
-        starts = np.stack([selection.nominal.points[0], selection.final.points[0]])
-        unused = predicted(selection.bench, [(), selection.included], starts, selection.noise)
-        judged = [_of_record(selection, unused, k) for k in range(len(records))]
+        judged = [_of_record(selection, k) for k in range(len(records))]
         on = "each record, predicted from the others"
         if len(records) == 1:
             on = f"the last {HELD_BACK:.0%} of the record, which was held back"
-    return Gain(_gains([_together(judged)], rng)[0], tuple(_gains(judged, rng)), names, on)
+    by_record = _gains(judged, rng)
+    outputs = by_record[0] if len(judged) == 1 else _gains([_together(judged)], rng)[0]
+    return Gain(outputs, tuple(by_record), names, on)
 
 
 def _gains(judged: Sequence[_Judged], rng) -> list[dict[str, OutputGain]]:
@@ -121,12 +121,12 @@ def _validated(selection: Selection, nominal: Fit, extended: Fit, record: Record
     )
 
 
-def _of_record(selection: Selection, unused: Predicted, record: int) -> _Judged:
+def _of_record(selection: Selection, record: int) -> _Judged:
     """Return one record, or the part of it that was not used."""
-    bench, noises = selection.bench, selection.noise.of[record]
+    bench, noises, unused = selection.bench, selection.noise.of[record], selection.unused
     there = unused.noise.measured[record].any(axis=-1)
     kept = np.where(unused.noise.measured[record], 1.0, np.nan)[there]
-    before, after = (residual[record, there] * kept for residual in unused.residual)
+    before, after = (residual[record, there] * kept for residual in unused.residual[[-1, 0]])
     readings = bench.problem.samples.outputs[record, there] * kept
     named = [(i, n) for i, n in enumerate(bench.problem.observed) if n in bench.records[record].outputs]
     return _Judged(

@@ -128,7 +128,7 @@ def _most_telling(each) -> list[str]:
 def _draw_suspects(axes, diagnosis: Diagnosis) -> None:
     table = diagnosis.table
     table = table[np.isfinite(table["score"].astype(float))].drop_duplicates("cause").head(_SUSPECTS)[::-1]
-    within = {name for a in diagnosis.alternatives for name in a.causes} | set(diagnosis.causes)
+    within = {name for a in diagnosis.alternatives for name in a.causes} | set(diagnosis.names)
     colours = [_MODEL if cause in within else _MEASURED for cause in table["cause"]]
     scores = table["score"].astype(float).abs()
     axes.barh(range(len(table)), scores, color=colours)

@@ -41,7 +41,7 @@ def table_of(selection: Selection) -> "pandas.DataFrame":
     responses = np.array([s.response for s in screening.ranked])
     alike = np.abs(responses @ responses.T) if len(responses) else np.zeros((0, 0))
     detectable = _detectable(selection)
-    gains = dict(zip(selection.included, selection.gains, strict=True))
+    gains = {i: need.gain for i, need in zip(selection.included, selection.needs, strict=True)}
     rows = []
     for k, s in enumerate(screening.ranked):
         candidate = bench.candidates[s.candidate]

@@ -1,11 +1,12 @@
 """A diagnosis in sentences."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
+from ehsvjax.diagnosis.results.causes import Cause, how_sure
 
 if TYPE_CHECKING:
     from ehsvjax.diagnosis.results.diagnosis import Diagnosis
@@ -41,19 +42,20 @@ def integration_line(diagnosis: "Diagnosis") -> str:
 
 
 def verdict(diagnosis: "Diagnosis") -> str:
-    """Return the verdict in a sentence."""
-    left = "" if diagnosis.innocent else " Something is left that no candidate explains."
+    """Return the verdict in a sentence: which causes, how sure, what they explain, what is left."""
     if diagnosis.verdict == "adequate":
         coloured = any(m.coloured for outputs in diagnosis.misfit.by_record for m in outputs.values())
         chance = " It is correlated: whether it is chance, a repeat of the experiment tells." if coloured else ""
         return f"adequate. What the model leaves is noise: it depends on nothing that runs along the model.{chance}"
     if diagnosis.verdict == "named":
-        return f"{causes(diagnosis)}.{_explained(diagnosis)}{left}"
+        return f"{_stated(diagnosis)}.{_explained(diagnosis)}{_left(diagnosis)}"
     if diagnosis.verdict == "ambiguous":
-        return f"ambiguous: {causes(diagnosis)}: {these(diagnosis)} cannot tell.{_explained(diagnosis)}{left}"
+        return (
+            f"ambiguous: {_stated(diagnosis)}: {these(diagnosis)} cannot tell.{_explained(diagnosis)}{_left(diagnosis)}"
+        )
     better = "a single term explains the record better than several effects of the bank together"
-    why = better if diagnosis.innocent else "no effect of the bank leaves an innocent residual"
-    return f"unexplained. Something is missing, and {why}."
+    why = better if diagnosis.innocent else "no effect of the bank has earned its place"
+    return f"unexplained. Something is missing, and {why}.{_or_chance(diagnosis)}"
 
 
 def _explained(diagnosis: "Diagnosis") -> str:
@@ -66,11 +68,51 @@ def _explained(diagnosis: "Diagnosis") -> str:
     return f" {' and '.join(each)} of what was wrong is explained, on data that were not used."
 
 
+def _left(diagnosis: "Diagnosis") -> str:
+    """Return what no cause explains."""
+    left = diagnosis.left
+    if left.innocent:
+        return ""
+    seen = f"it depends on {left.quantity} (seen from {left.place})"
+    return f" Something is left that no candidate explains: {seen}.{_or_chance(diagnosis)}"
+
+
+def _or_chance(diagnosis: "Diagnosis") -> str:
+    return " Or it is chance: a repeat of the experiment tells." if diagnosis.undecided else ""
+
+
 def causes(diagnosis: "Diagnosis") -> str:
-    """Return the causes in words, each with what it cannot be told from; none if nothing is named."""
-    groups = [" or ".join(a.causes) for a in diagnosis.alternatives]
-    alone = [c for c in diagnosis.causes if all(c not in a.causes for a in diagnosis.alternatives)]
+    """Return the names of the causes, each with what it cannot be told from; none if nothing is named."""
+    return _joined(diagnosis, lambda name, probability: name)
+
+
+def _stated(diagnosis: "Diagnosis") -> str:
+    """Return the causes, each with how large and how sure, and with what it cannot be told from."""
+    sizes = {cause.name: _brief(diagnosis, cause) for cause in diagnosis.causes}
+
+    def stated(name, probability):
+        return f"{name} ({', '.join(filter(None, [sizes.get(name), how_sure(probability)]))})"
+
+    return _joined(diagnosis, stated)
+
+
+def _joined(diagnosis: "Diagnosis", said: Callable[[str, float], str]) -> str:
+    groups = [" or ".join(map(said, a.causes, a.probabilities)) for a in diagnosis.alternatives]
+    within = {name for a in diagnosis.alternatives for name in a.causes}
+    alone = [said(cause.name, cause.probability) for cause in diagnosis.causes if cause.name not in within]
     return ("; and " if groups else " and ").join([*alone, *groups])
+
+
+def _brief(diagnosis: "Diagnosis", cause: Cause) -> str:
+    """Return the first number of a cause; none where each record has its own."""
+    if not cause.sizes or cause.sizes[0].record is not None:
+        return ""
+    if _given(diagnosis, cause):
+        return ""
+    waves = {size.number: size.value for size in cause.sizes}
+    if {"cosine", "sine"} <= set(waves):
+        return f"{np.hypot(waves['cosine'], waves['sine']):.3g}{_spaced(cause.sizes[0].unit)}"
+    return f"{cause.sizes[0].value:.3g}{_spaced(cause.sizes[0].unit)}"
 
 
 def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
@@ -105,18 +147,7 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
 
 def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
-    lines = []
-    included = diagnosis.table[diagnosis.table["included"]] if len(diagnosis.table) else diagnosis.table
-    for row in included.drop_duplicates("cause").itertuples():
-        what = (
-            _instead(diagnosis, str(row.cause)) or f"{row.cause} at {row.signal}: {_sizes(diagnosis, str(row.cause))}"
-        )
-        lines.append(f"{what}; it gains {row.likelihood_gain:.4g} times what chance would")
-    if diagnosis.process_noise is not None:
-        place, intensity, *_ = diagnosis.process_noise
-        unit = diagnosis.fit.model.unit(place)
-        density = f"({unit})^2 s" if unit else "s"
-        lines.append(f"process_noise: a random force at {place} of spectral density {intensity:.3g} {density}")
+    lines = [_cause_line(diagnosis, cause) for cause in diagnosis.causes]
     m = diagnosis.missing
     if m is not None:
         unit = _spaced("of its value" if m.relative else m.unit)
@@ -135,6 +166,54 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     return lines
 
 
+def _cause_line(diagnosis: "Diagnosis", cause: Cause) -> str:
+    """Return a cause with its numbers and their errors, how sure it is, what it is needed for, and by which records."""
+    numbers = ", ".join(
+        filter(None, [_number_words(cause, name) for name in dict.fromkeys(s.number for s in cause.sizes)])
+    )
+    said = [_given(diagnosis, cause) or f"{cause.name} at {cause.signal}{': ' if numbers else ''}{numbers}"]
+    said.append(how_sure(cause.probability))
+    if np.isfinite(cause.gain):
+        said.append(f"it gains {cause.gain:.4g} times what chance would")
+    if cause.share > 0.0:
+        said.append(
+            f"without it {100 * min(cause.share, 1.0):.0f}% of what was wrong comes back, on data that were not used"
+        )
+    if cause.of_run:
+        said.append(
+            f"of {'this run' if len(diagnosis.records) == 1 else 'these runs'}, nothing that another would have"
+        )
+    elif len(diagnosis.records) > len(cause.records):
+        said.append(
+            f"{' and '.join(cause.records) or 'no single record'} {'want' if len(cause.records) > 1 else 'wants'} it"
+        )
+    if cause.contradicted_by:
+        said.append(f"{' and '.join(cause.contradicted_by)} would do better without it")
+    return "; ".join(said)
+
+
+def _number_words(cause: Cause, number: str) -> str:
+    """Return one number of a cause with its standard error, of each record where each has its own."""
+    each = [size for size in cause.sizes if size.number == number]
+    values = ", ".join(
+        f"{s.value:.4g} +/- {s.standard_error:.2g}" if np.isfinite(s.standard_error) else f"{s.value:.4g}" for s in each
+    )
+    return f"{number} {values}{_spaced(each[0].unit)}"
+
+
+def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
+    """Return what a constant is instead of what was given; nothing for any other cause."""
+    given = next((p for p in diagnosis.fit.model.parameters if p.name == cause.name), None)
+    if given is None or not cause.sizes or cause.sizes[0].number not in ("error", "value"):
+        return ""
+    size = cause.sizes[0]
+    factor, offset = (given.value, given.value) if size.number == "error" else (1.0, 0.0)
+    return (
+        f"{cause.name}: {offset + factor * size.value:.4g} +/- {factor * size.standard_error:.2g}{_spaced(given.unit)} "
+        f"instead of the {given.value:.4g} that was given"
+    )
+
+
 def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Any]]:
     """Return what there is of each output in each record, with the names of both; of a single record without."""
     said = [f"{name}, " if len(names) > 1 else "" for name in names]
@@ -143,30 +222,6 @@ def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> li
 
 def _names(diagnosis: "Diagnosis") -> list[str]:
     return [record.name for record in diagnosis.records]
-
-
-def _sizes(diagnosis: "Diagnosis", cause: str) -> str:
-    """Return the numbers of a cause with their units; of its run, one for each record."""
-    model, said = diagnosis.extended.model, []
-    for p in model.parameters:
-        own, _, number = p.name.rpartition(".")
-        if own == cause:
-            shared = diagnosis.extended.parameters.get(p.name)
-            each = [record.constants[p.name] for record in diagnosis.extended.records] if shared is None else [shared]
-            values = ", ".join(f"{value:.4g}" for value in each)
-            said.append(f"{number} {values}{_spaced(p.unit)}")
-    return ", ".join(said)
-
-
-def _instead(diagnosis: "Diagnosis", cause: str) -> str | None:
-    """Return what a constant is instead of what was given; None for any other cause."""
-    given = next((p for p in diagnosis.fit.model.parameters if p.name == cause), None)
-    found_at = diagnosis.extended.parameters
-    if given is None or not {f"{cause}.error", f"{cause}.value"} & set(found_at):
-        return None
-    error = found_at.get(f"{cause}.error")
-    found = found_at[f"{cause}.value"] if error is None else given.value * (1.0 + error)
-    return f"{cause}: {found:.4g}{_spaced(given.unit)} instead of the {given.value:.4g} that was given"
 
 
 def gain_lines(diagnosis: "Diagnosis") -> list[str]:

@@ -1,4 +1,7 @@
-"""What chance can do: how near two explanations may come, and how good the best of many tests under noise alone is."""
+"""The one currency: noise variances by which explanations differ, what chance can do to them, how sure that makes one.
+
+Every threshold of a decision stands here.
+"""
 
 from collections.abc import Callable, Sequence
 
@@ -11,6 +14,13 @@ INSEPARABLE = 3.0**2
 Where the true cause can be expected to be 5^2 better than a rival, chance brings the refits as near as 3^2 in 2% of
 all records (3.5^2 in 7%); a rival that is 3^2 better than the true cause is as rare as three standard deviations.
 """
+SIGNIFICANT = 0.002
+"""Corrected p-value of a whole search below which something is taken to be there."""
+PER_NUMBER = 4.0
+"""Noise variances that each number of an effect must bring, so that more numbers are no advantage."""
+CONVINCING = 20.0
+"""Twice the log-likelihood by which a random force must be better than the noise of a sensor, or than a single cause
+that leaves nothing unexplained."""
 _DRAWS = 20_000
 # Draws below which a share of all draws says little.
 _FEW = 20
@@ -46,3 +56,13 @@ def corrected(p: float, smallest: Float[np.ndarray, " draw"], tests: int) -> flo
     share = float(np.searchsorted(smallest, p, side="right")) / len(smallest)
     few = _FEW / len(smallest)
     return share if share >= few else min(tests * p, few)
+
+
+def probabilities(deficits: Sequence[float]) -> Float[np.ndarray, " explanation"]:
+    """Return how probable each of several explanations is, from how far it is behind the best, in noise variances.
+
+    Prices are part of a deficit, as logarithms of what is known beforehand; twice the logarithm of a likelihood ratio
+    is what is left of it (Bayes' theorem at the refits).
+    """
+    weights = np.exp(-0.5 * (np.asarray(deficits, dtype=float) - np.min(deficits)))
+    return weights / np.sum(weights)

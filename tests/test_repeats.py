@@ -1,0 +1,46 @@
+"""Chance or not: what a repeat of the experiment leaves again is not chance, however little the bank knows of it."""
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
+from tests.small_models import carriage, carriage_plant, record_of
+
+PERIOD, SAMPLES, KEY = 0.02, 1500, jax.random.key(0)
+PUSH = np.repeat(np.random.default_rng(3).uniform(-10.0, 10.0, SAMPLES // 20), 20)
+
+
+def shaken(force, seed):
+    """A record of a carriage with a further force [time]."""
+    position = carriage_plant(PUSH + force, PERIOD)[:, 0]
+    return record_of(PERIOD, {"push": PUSH}, {"position": position}, {"position": 0.002}, seed, f"run {seed}")
+
+
+def random_force(seed):
+    return 2.0 * np.random.default_rng([8, seed]).standard_normal(SAMPLES)
+
+
+def diagnosed(records):
+    fit = ehsvjax.identify(carriage(), records, key=KEY, population=20, generations=5)
+    return ehsvjax.diagnose(fit, records, key=KEY)
+
+
+def test_one_record_does_not_tell_chance_from_what_the_bank_lacks():
+    found = diagnosed([shaken(random_force(1), 1)])
+    assert (found.verdict, found.names) == ("ambiguous", (PROCESS_NOISE,)), str(found)
+    assert found.alternatives[0].causes == (PROCESS_NOISE, UNKNOWN)
+    assert "the same experiment again" in str(found)
+
+
+@pytest.mark.parametrize("chance", [True, False])
+def test_a_repeat_of_the_experiment_settles_it(chance):
+    # A disturbance that no effect of the bank is, the same in both runs, or another.
+    records = [shaken(random_force(seed if chance else 1), seed) for seed in (1, 2)]
+    found = diagnosed(records)
+    if chance:
+        assert (found.verdict, found.names) == ("named", (PROCESS_NOISE,)), str(found)
+    else:
+        assert PROCESS_NOISE not in {*found.names, *(name for a in found.alternatives for name in a.causes)}, str(found)
+        assert found.verdict != "adequate", str(found)
