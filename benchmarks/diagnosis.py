@@ -26,7 +26,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 import ehsvjax
-from benchmarks.processes import rows_of
+from benchmarks.processes import rows_of, said
 from ehsvjax.diagnosis import Diagnosis, diagnose
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
 from tests.hidden_oracle import SEPARABLE, oracle, worth_each
@@ -103,10 +103,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         rows.append(
             row
             | {
-                "verdict": d.verdict,
-                "causes": d.names,
-                "groups": [a.causes for a in d.alternatives],
-                "innocent": d.innocent,
+                **said(d),
                 "seconds": time.perf_counter() - identified,
                 "seconds_to_fit": identified - began,
                 "rmse_after_over_noise": gain.rmse_after / gain.noise_floor,

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 import ehsvjax
-from benchmarks.processes import rows_of
+from benchmarks.processes import rows_of, said
 from benchmarks.several_outputs import outcome
 from ehsvjax.diagnosis import diagnose
 from tests.hidden_plants import EFFECTS, Valve, effect_sizes, held_levels, servovalve_with, van_der_pol_with
@@ -210,10 +210,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         rows.append(
             row
             | {
-                "verdict": d.verdict,
-                "causes": d.names,
-                "groups": [a.causes for a in d.alternatives],
-                "innocent": d.innocent,
+                **said(d),
                 "arithmetic": d.integration.worth,
                 "rmse_over_noise": fit.rmse["position"] / noise,
                 "after_over_noise": gain.rmse_after / noise,

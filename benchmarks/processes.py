@@ -10,6 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from ehsvjax.diagnosis import Diagnosis
+
 # Trials of one kind that a process makes and diagnoses together, at most: an own plant steps them all at once.
 _TOGETHER = 8
 
@@ -43,3 +45,16 @@ def rows_of(
             rows += found
             path.write_text(json.dumps(rows, indent=1, default=float))
     return rows
+
+
+def said(found: Diagnosis) -> dict[str, Any]:
+    """Return what a diagnosis says, as columns of a row: the verdict, the causes, the groups, how probable each is."""
+    grouped = [dict(zip(a.causes, a.probabilities, strict=True)) for a in found.alternatives]
+    alone = [{c.name: c.probability} for c in found.causes if not any(c.name in group for group in grouped)]
+    return {
+        "verdict": found.verdict,
+        "causes": found.names,
+        "groups": [a.causes for a in found.alternatives],
+        "probabilities": [*alone, *grouped],
+        "innocent": found.innocent,
+    }

@@ -23,7 +23,7 @@ import pandas as pd
 from scipy.optimize import least_squares
 
 import ehsvjax
-from benchmarks.processes import rows_of
+from benchmarks.processes import rows_of, said
 from ehsvjax.diagnosis import diagnose
 from tests.hidden_plants import SERVOVALVE_EFFECTS, servovalve_with
 from tests.hidden_records import Hidden, sizes_of
@@ -183,9 +183,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
             rows.append(row | {"verdict": "failed", "error": traceback.format_exc(limit=-4)})
             continue
         row |= {
-            "verdict": d.verdict,
-            "causes": d.names,
-            "groups": [a.causes for a in d.alternatives],
+            **said(d),
             "step_size": d.integration.step_size,
             "left_out": sum(d.integration.left_out.values()),
             "arithmetic": d.integration.worth,

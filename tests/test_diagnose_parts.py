@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, corrected, probabilities, smallest_p_values
-from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise, surely_gained
 from ehsvjax.diagnosis.bench.readings import lattice, spikes
 from ehsvjax.diagnosis.hypotheses.curves import _all_waves, knots_along, single_waves
 from ehsvjax.diagnosis.hypotheses.dependence import _log_of_chi_square
@@ -304,3 +304,19 @@ def test_probabilities_are_those_of_bayes_whatever_is_common_to_all(deficits, co
 def test_what_cannot_be_there_has_no_probability():
     assert probabilities([0.0, np.inf, 0.0]) == pytest.approx([0.5, 0.0, 0.5])
     assert probabilities([0.0, 2.0 * np.log(3.0)]) == pytest.approx([0.75, 0.25])
+
+
+def test_beside_slow_misfit_a_slow_difference_is_not_sure():
+    """Parts of a record are not independent where what is left outlasts them: as noise of its own it tells less."""
+    time = np.linspace(0.0, 1.0, 4000)
+    rng = np.random.default_rng(4)
+    wandering = lfilter([1.0], [1.0, -0.998], rng.standard_normal(4000))
+    best = series(rng.standard_normal(4000) + 3.0 * wandering / np.std(wandering))
+    other = best + series(1.2 * np.cos(2.0 * np.pi * time))
+    measured = np.ones((1, 4000, 1), bool)
+    white = plain_noise(np.ones(1), measured)
+    of_all = noise_outside(best, measured, np.zeros((1, 1, 4000, 1)))
+    assert of_all.coloured
+    least = surely_gained([white, of_all], other, best)
+    assert abs(least) <= abs(white.gained(other, best)) and abs(least) <= abs(of_all.gained(other, best))
+    assert surely_gained([white, of_all], best, best) == 0.0

@@ -5,6 +5,7 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -239,6 +240,16 @@ def noise_outside(
     return Noise(tuple(tuple(in_units(k, i) for i in range(signals)) for k in range(records)), measured)
 
 
+def surely_gained(
+    noises: Sequence[Noise],
+    left: Float[np.ndarray, "record time signal"],
+    more: Float[np.ndarray, "record time signal"],
+) -> float:
+    """Return the least of what one explanation gains on another under several noises; nothing if they do not agree."""
+    gains = [noise.gained(left, more) for noise in noises]
+    return min(gains, key=abs) if len({gain > 0.0 for gain in gains}) == 1 else 0.0
+
+
 def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
     """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples."""
     shape = responses.shape[1:]
@@ -248,7 +259,7 @@ def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
     # There are many more samples than responses: their products are quicker decomposed.
     squares, combinations = np.linalg.eigh(flat @ flat.T)
     order = np.argsort(-squares)[: flat.shape[1] // 2]
-    kept = order[squares[order] > _NEGLIGIBLE**2 * squares[-1]]
+    kept = order[squares[order] > _NEGLIGIBLE**2 * np.max(squares, initial=0.0)]
     vectors = (combinations[:, kept] / np.sqrt(squares[kept])).T @ flat
     return np.moveaxis(vectors.reshape(-1, *shape), 0, 2)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
@@ -69,6 +69,11 @@ def unexplained(
     return known, residual - known @ (known.T @ residual)
 
 
+def noise_of_all_left(bench: Workbench, final: Refits) -> Noise:
+    """Return the noise of a refit's residual, if all that is left of it is noise."""
+    return noise_outside(final.residual[0], bench.problem.samples.measured, final.slopes[0])
+
+
 def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
     """Return lists of columns side by side, filled up with -1."""
     return np.array([list(c) + [-1] * (width - len(c)) for c in columns])
@@ -118,7 +123,7 @@ def refit(
     damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
     cost = np.full(count, np.inf)
     converged = np.zeros(count, bool)
-    running = np.ones(count, bool)
+    running, bending = np.ones(count, bool), np.ones(count, bool)
     for k in range(count):
         own = chosen[k][chosen[k] >= 0]
         points[k, own] = np.clip(points[k, own], lower[own], upper[own])
@@ -146,13 +151,16 @@ def refit(
                 running[i] = False
                 continue
             step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
-            if gain < 0.01 * max(cost[i] / scaled.shape[1], 1e-300):
+            variance = max(cost[i] / scaled.shape[1], 1e-300)
+            bending[i] = gain > variance
+            if gain < 0.01 * variance:
                 converged[i] = True
                 running[i] = False
             elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
                 running[i] = False
             trial[i] = points[i] + step
-        _bend(bench, noise, trial, np.flatnonzero(running), points, chosen, kept, damping, lower, upper)
+        # Near the minimum no valley is left to follow.
+        _bend(bench, noise, trial, np.flatnonzero(running & bending), points, chosen, kept, damping, lower, upper)
     shape = bench.problem.samples.outputs.shape
     nothing = (np.full(shape, np.nan), np.zeros((width, *shape)))
     return Refits(

@@ -6,9 +6,10 @@ import numpy as np
 
 from ehsvjax.diagnosis.bench.evidence import CONVINCING, INSEPARABLE, SIGNIFICANT
 from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.refits import noise_of_all_left
 from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.repeats import repeats_itself
-from ehsvjax.diagnosis.decision.search import Selection, noise_of_all_left
+from ehsvjax.diagnosis.decision.search import Selection
 from ehsvjax.diagnosis.hypotheses.curves import terms_at
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence, dependences
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term, told_by

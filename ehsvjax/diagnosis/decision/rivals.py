@@ -6,10 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnosis.bench.evidence import PER_NUMBER
-from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER
+from ehsvjax.diagnosis.bench.noise import Noise, surely_gained
+from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left, padded, refit
 from ehsvjax.diagnosis.bench.workbench import Workbench
+from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -78,7 +79,7 @@ def rivals_again(
         starts, others = [[r.refitted.points[0]] for r in able], [r.candidate for r in able]
         led = refit_sets(trials, starts, [(*rest, i) for i in others], noise, race=True) if others else None
         found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
-        ranked.append(_ranked(trials, own, {own: final} | found, noise))
+        ranked.append(_ranked(trials, own, rest, {own: final} | found, noise))
     for own, group in zip(included, ranked, strict=True):
         if group[0].candidate != own:
             included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
@@ -94,25 +95,42 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, n
     base = _beside(trials, start, current, noise) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
     found = _refitted_from(trials, base, own, rest, noise, start)
-    return _ranked(trials, own, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
+    return _ranked(trials, own, rest, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
 
 
-def _ranked(trials: Trials, own: int, found: Mapping[int, Refits], noise: Noise) -> tuple[Rival, ...]:
-    """Return what was refitted in the place of an effect, the best first, with how much worse each is."""
+def _ranked(
+    trials: Trials, own: int, rest: tuple[int, ...], found: Mapping[int, Refits], noise: Noise
+) -> tuple[Rival, ...]:
+    """Return what was refitted in the place of an effect, the best first, with how much worse each is.
+
+    What would take its place, and predicts unused data worse by more than chance, is no rival.
+    """
     able = {candidate: refitted for candidate, refitted in found.items() if np.isfinite(_cost(refitted))}
     prices = {candidate: price(trials.bench, candidate, refitted.points[0]) for candidate, refitted in able.items()}
 
     def behind(best: int) -> dict[int, float]:
         """Return by how much each is worse than one of them, their prices included."""
+        # All that the best leaves may be chance, and what they do differently must stand out from that too.
+        every_noise = noise, noise_of_all_left(trials.bench, able[best])
         return {
-            candidate: noise.gained(refitted.residual[0], able[best].residual[0]) + prices[candidate] - prices[best]
+            candidate: surely_gained(every_noise, refitted.residual[0], able[best].residual[0])
+            + prices[candidate]
+            - prices[best]
             for candidate, refitted in able.items()
         }
 
-    lowest = behind(min(able, key=lambda candidate: _cost(able[candidate])))
-    best = min(lowest, key=lambda candidate: lowest[candidate])
-    # As good but for rounding: no reason to swap.
-    best = own if lowest[own] < lowest[best] + 1e-3 else best
+    while True:
+        lowest = behind(min(able, key=lambda candidate: _cost(able[candidate])))
+        best = min(lowest, key=lambda candidate: lowest[candidate])
+        # As good but for rounding: no reason to swap.
+        best = own if lowest[own] < lowest[best] + 1e-3 else best
+        if best == own:
+            break
+        points = np.concatenate([able[own].points, able[best].points])
+        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, noise)
+        if not unused.noise.gained(unused.residual[1], unused.residual[0]) > INSEPARABLE:
+            break
+        del able[best]
     ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))
     return tuple(Rival(candidate, max(0.0, deficit), able[candidate]) for candidate, deficit in ranked)
 

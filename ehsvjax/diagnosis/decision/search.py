@@ -10,9 +10,9 @@ from jaxtyping import Float
 from ehsvjax.arithmetic import finest
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
-from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise, surely_gained
 from ehsvjax.diagnosis.bench.progress import Progress
-from ehsvjax.diagnosis.bench.refits import Refits
+from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left
 from ehsvjax.diagnosis.bench.workbench import Workbench, prepared, settled
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
@@ -360,7 +360,7 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         points.append(refitted.points[0])
         both = refitted.residual[0], final.residual[0]
         needs.append(Need(
-            gain=min(one.gained(*both) for one in every_noise),
+            gain=surely_gained(every_noise, *both),
             of_record=tuple(noise.of_record(k).gained(*both) for k in range(len(trials.bench.records))),
             required=required_gain(trials.bench, stage.screening, i),
         ))  # fmt: skip
@@ -368,11 +368,6 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         sets.append(())
         points.append(nominal.points[0])
     return tuple(needs), predicted(trials.bench, sets, np.stack(points), noise)
-
-
-def noise_of_all_left(bench: Workbench, final: Refits) -> Noise:
-    """Return the noise of a refit's residual, if all that is left of it is noise."""
-    return noise_outside(final.residual[0], bench.problem.samples.measured, final.slopes[0])
 
 
 def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted) -> int | None:

@@ -80,7 +80,8 @@ class _Test(NamedTuple):
 
     def heights(self, components: Float[np.ndarray, "draw direction"]) -> Float[np.ndarray, "wave draw"]:
         """Return what each wave alone takes of the sum of squares."""
-        return np.stack([np.sum((components @ wave) ** 2, axis=-1) for wave in self.waves])
+        phases = components @ np.concatenate([*self.waves], axis=1).astype(components.dtype)
+        return np.sum(phases.reshape(len(components), len(self.waves), -1) ** 2, axis=-1).T
 
 
 def _explained(components) -> float:
