@@ -79,7 +79,7 @@ def meat(
     jacobian: Float[np.ndarray, "record time parameter"], noise: ResidualNoise
 ) -> Float[np.ndarray, "parameter parameter"]:
     """Return J^T Sigma J over the records, for one output; rows of J without a sample are zero."""
-    flat = jacobian.reshape(-1, jacobian.shape[-1])
+    flat = jacobian.reshape(int(np.prod(jacobian.shape[:-1])), jacobian.shape[-1])
     return flat.T @ _correlated(jacobian, noise).reshape(flat.shape)
 
 
