@@ -8,7 +8,7 @@ import ehsvjax
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.workbench import workbench
-from ehsvjax.diagnosis.hypotheses.harmonics import parts_of, with_frequencies
+from ehsvjax.diagnosis.hypotheses.harmonics import _of_inputs, parts_of, period_of, with_frequencies
 from ehsvjax.effects import BANK
 from tests.hidden_plants import van_der_pol_with
 
@@ -64,3 +64,28 @@ def test_the_frequency_of_what_is_there_is_among_those_that_are_tried(fit, effec
     tried = with_frequencies(bench, current, noise, parts_of(bench)).scales[effect]["frequencies"]
     resolution = 2.0 * np.pi / (SAMPLES * PERIOD)
     assert min(abs(frequency - sizes["frequency"]) for frequency in tried) < 0.5 * resolution
+
+
+@pytest.mark.parametrize("period", [37, 100, 251])
+def test_an_input_that_repeats_itself_is_known_by_its_period(period):
+    once = np.repeat(np.random.default_rng(6).uniform(-1.0, 1.0, period // 5 + 1), 5)[:period]
+    wave = np.sin(2.0 * np.pi * np.arange(1200) / period) + 0.01 * np.random.default_rng(7).standard_normal(1200)
+    assert period_of(np.resize(once, 1200)) == period
+    assert period_of(wave) in (period, 2 * period)
+
+
+@pytest.mark.parametrize(
+    "series",
+    [COMMAND, np.linspace(0.0, 1.0, 600), np.zeros(600), np.repeat([0.0, 1.0], 300), np.resize(COMMAND[:200], 600)],
+    ids=["random", "ramp", "nothing", "step", "three times"],
+)
+def test_an_input_that_does_not_or_hardly_repeats_itself_has_none(series):
+    assert period_of(series) is None
+
+
+def test_what_goes_by_an_input_is_no_disturbance_and_what_does_not_may_be_one():
+    periods = [(2.0, 14.0)]
+    for multiple in (1, 2, 5):
+        assert _of_inputs(2.0 * np.pi * multiple / 2.0, periods)
+    assert not _of_inputs(2.0 * np.pi * 1.3 / 2.0, periods) and not _of_inputs(0.1, periods)
+    assert not _of_inputs(2.0 * np.pi / 2.0, [])

@@ -71,7 +71,7 @@ def test_each_record_is_predicted_from_the_others(bent):
         assert outputs["position"].rmse_after == pytest.approx(noise, rel=0.2)
         assert outputs["position"].rmse_before > outputs["position"].rmse_after
     said = str(found)
-    assert said.startswith("Van der Pol oscillator on long and short: cubic_stiffness.")
+    assert said.startswith("Van der Pol oscillator on long and short: cubic_stiffness (")
     assert "long, position: " in said and "short, position: " in said
 
 

@@ -1,6 +1,7 @@
 """Effects on forces and on what is stored: friction, stiffness, stops; in the signs of a driving force or a load."""
 
 import functools
+import math
 
 import jax.numpy as jnp
 
@@ -23,7 +24,8 @@ _FREQUENCY = shape(
     "frequency",
     "rad/s",
     lambda scales: scales["frequencies"],
-    lambda scales: 3.0 / scales["duration"],
+    # What a record has not shown twice is not known to be periodic: it would stand for anything that is slow.
+    lambda scales: 4.0 * math.pi / scales["duration"],
     lambda scales: 2.0 / scales["sample_period"],
 )
 

@@ -1,7 +1,8 @@
 """The frequencies at which harmonic effects are tried: those at which they would explain most of a residual.
 
 What an effect does at some frequency is the sum of what it does in short parts of the record, which need to be
-simulated once only. Frequencies too high for the parts are looked for in the residual itself.
+simulated once only. Frequencies too high for the parts are looked for in the residual itself. Where the inputs repeat
+themselves, their own frequency and its multiples are left out: what goes by them a nonlinear model makes of its inputs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,8 @@ _TRIED = 3
 _APART, _CLOSE = 2.0, 0.2
 # Periods of the highest frequency whose share over a part is known well enough.
 _PERIODS_PER_PART = 0.35
+# Periods of an input that repeats itself, at least, and how alike they are, as a correlation.
+_LEAST_PERIODS, _ALIKE = 4, 0.99
 
 
 def parts_of(bench: Workbench) -> dict[str, Parts]:
@@ -36,6 +39,7 @@ def with_frequencies(bench: Workbench, current: Refits, noise: Noise, parts: Map
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
     duration = duration_of(bench.records)
     known, r = unexplained(current, noise.innovations)
+    of_inputs = _periods_of_inputs(bench)
     scales: dict[str, Scales] = {}
     for candidate in bench.candidates:
         if not candidate.effect.harmonic:
@@ -53,8 +57,53 @@ def with_frequencies(bench: Workbench, current: Refits, noise: Noise, parts: Map
         # A record that does not hold the first output says nothing of it.
         for k in np.flatnonzero(bench.problem.samples.measured[..., 0].any(axis=1)).tolist():
             peaks += _peaks(*_periodogram(bench, current, k, lowest, highest))
+        peaks = [(strength, frequency) for strength, frequency in peaks if not _of_inputs(frequency, of_inputs)]
         scales[candidate.name] = {**own, "frequencies": _strongest(peaks, duration) or own["frequencies"]}
     return replace(bench, scales={**bench.scales, **scales})
+
+
+def _periods_of_inputs(bench: Workbench) -> list[tuple[float, float]]:
+    """Return the period, s, of each input that repeats itself in a record, and for how long the record goes on, s."""
+    found = []
+    for k, there in enumerate(bench.present):
+        period = float(bench.problem.samples.sample_period[k])
+        for name in bench.fit.model.inputs:
+            lag = period_of(bench.records[k].inputs[name])
+            if lag is not None:
+                found.append((lag * period, int(there.sum()) * period))
+    return found
+
+
+def period_of(series: Float[np.ndarray, " time"]) -> int | None:
+    """Return after how many samples a series repeats itself; None if it does not, or too few times to tell."""
+    from scipy.signal import correlate
+
+    centred = series - np.mean(series)
+    size = len(centred)
+    most = size // _LEAST_PERIODS
+    if most < 2 or not centred.any():
+        return None
+    squares = np.concatenate([[0.0], np.cumsum(centred**2)])
+    lags = np.arange(most + 1)
+    # Of what both parts hold: the one without its end, and the one without its beginning.
+    both = squares[size - lags] * (squares[-1] - squares[lags])
+    alike = correlate(centred, centred, "full", "fft")[size - 1 : size + most] / np.sqrt(np.maximum(both, 1e-300))
+    unlike = np.flatnonzero(alike < 0.5)
+    again = np.flatnonzero(alike[unlike[0] :] > _ALIKE) + unlike[0] if len(unlike) else unlike
+    if not len(again):
+        return None
+    # The best of the first that are alike.
+    first = again[: np.flatnonzero(np.diff(again, append=size) > 1)[0] + 1]
+    return int(first[np.argmax(alike[first])])
+
+
+def _of_inputs(frequency: float, periods: Sequence[tuple[float, float]]) -> bool:
+    """Whether a frequency, rad/s, is a multiple of that of an input, as far as a record tells."""
+    for period, duration in periods:
+        turns = frequency * period / (2.0 * np.pi)
+        if np.round(turns) >= 1.0 and abs(turns - np.round(turns)) < 0.5 * period / duration:
+            return True
+    return False
 
 
 def _by_parts(bench: Workbench, candidate: Candidate) -> bool:

@@ -5,14 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, how_sure
 
 if TYPE_CHECKING:
     from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 
-# Excluded effects that are printed.
-_NAMED = 10
+# Excluded effects that are printed, and such as come near.
+_NAMED, _NEAREST = 10, 3
 
 
 def sentences(diagnosis: "Diagnosis") -> list[str]:
@@ -148,6 +149,8 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
 def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
     lines = [_cause_line(diagnosis, cause) for cause in diagnosis.causes]
+    if diagnosis.verdict == "unexplained":
+        lines += _not_sure(diagnosis)
     m = diagnosis.missing
     if m is not None:
         unit = _spaced("of its value" if m.relative else m.unit)
@@ -163,6 +166,18 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
         if m.alike:
             others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
             lines.append(f"a term {others} would explain as much")
+    return lines
+
+
+def _not_sure(diagnosis: "Diagnosis") -> list[str]:
+    """Return what comes nearest where no cause is sure: what the extended model has, and what scores most."""
+    table = diagnosis.table.drop_duplicates("cause")
+    tried = ", ".join(table.loc[table["included"], "cause"])
+    near = table[~table["included"] & (table["p_corrected"] < SIGNIFICANT)].head(_NEAREST)
+    scores = [f"{cause} ({score:.1f})" for cause, score in zip(near["cause"], near["score"].abs(), strict=True)]
+    lines = [f"the best of the bank together: {tried}; the extended model has them"] if tried else []
+    if scores and not tried:
+        lines.append(f"nearest in the bank, none of them sure: {', '.join(scores)} standard deviations")
     return lines
 
 
