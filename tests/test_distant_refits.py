@@ -8,7 +8,7 @@ import ehsvjax
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import bounds_of, padded, refit
-from ehsvjax.diagnosis.bench.workbench import workbench
+from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen
 from ehsvjax.effects import BANK

@@ -7,7 +7,7 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
-from ehsvjax.diagnosis.bench.workbench import workbench
+from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.hypotheses.harmonics import _of_inputs, parts_of, period_of, with_frequencies
 from ehsvjax.effects import BANK
 from tests.hidden_plants import van_der_pol_with

@@ -9,7 +9,7 @@ import ehsvjax
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
-from ehsvjax.diagnosis.bench.workbench import workbench
+from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.effects import BANK
 from ehsvjax.models.model import Model, Parameter, Signal
 

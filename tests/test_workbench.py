@@ -10,7 +10,8 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
-from ehsvjax.diagnosis.bench.workbench import _simulated, workbench
+from ehsvjax.diagnosis.bench.setup import workbench
+from ehsvjax.diagnosis.bench.workbench import _simulated
 from ehsvjax.diagnosis.decision.search import _look, _weighed
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along

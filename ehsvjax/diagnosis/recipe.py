@@ -11,7 +11,8 @@ from ehsvjax.checks import flag
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.progress import bar as progress_bar
 from ehsvjax.diagnosis.bench.readings import spikes
-from ehsvjax.diagnosis.bench.workbench import Workbench, workbench
+from ehsvjax.diagnosis.bench.setup import workbench
+from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.examination import Examination, examine, remaining_term
 from ehsvjax.diagnosis.decision.search import select
 from ehsvjax.diagnosis.decision.verdict import verdict_of
