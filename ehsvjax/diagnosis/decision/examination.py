@@ -46,6 +46,11 @@ class Examination(NamedTuple):
     instead: MissingTerm | None
     lacking: bool
 
+    @property
+    def chance_deficit(self) -> float:
+        """By how much a random force is behind the causes, with what it has to be better by."""
+        return self.chance_behind + _must_be_better_by(self.selection, self.innocent)
+
 
 def examine(selection: Selection) -> Examination:
     """Test what a selection leaves, and whether something else explains the record better."""
@@ -115,9 +120,7 @@ def _random_force(
         final = process_noise(bench, selection.final, selection.noise)
         # Where no force shows any more, the causes have made it invisible.
         behind = np.inf if final is None else final.of_sensor - nominal.likelihood - _least_price(selection)
-        # A single cause that leaves nothing unexplained has the first word.
-        single = innocent and len(selection.included) == 1
-        if not behind < -(CONVINCING if single else INSEPARABLE):
+        if not behind < -_must_be_better_by(selection, innocent):
             return None, behind
     if _significant(before):
         # A term that depends on what runs along the model is a better reason than chance.
@@ -125,6 +128,11 @@ def _random_force(
         if _likelihood(selection.noise, term) > nominal.likelihood:
             return None, np.inf
     return nominal._replace(settled=repeated is False), behind
+
+
+def _must_be_better_by(selection: Selection, innocent: bool) -> float:
+    """Return by how much a random force must beat causes: a single one that leaves nothing has the first word."""
+    return CONVINCING if innocent and len(selection.included) == 1 else INSEPARABLE
 
 
 def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:

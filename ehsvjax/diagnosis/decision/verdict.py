@@ -75,7 +75,7 @@ def _group(examined: Examination, k: int) -> dict[str, float]:
     selection = examined.selection
     rivals, need = selection.rivals[k], selection.needs[k]
     deficits = [rival.deficit for rival in rivals]
-    every = probabilities([*deficits, examined.chance_behind, _nothing_behind(need)])
+    every = probabilities([*deficits, examined.chance_deficit, _nothing_behind(need)])
     found: dict[str, float] = {}
     for rival, probable in zip(rivals, every, strict=False):
         name = selection.bench.candidates[rival.candidate].name
