@@ -190,7 +190,8 @@ def _cause_line(diagnosis: "Diagnosis", cause: Cause) -> str:
     said.append(how_sure(cause.probability))
     if np.isfinite(cause.gain):
         said.append(f"it gains {cause.gain:.4g} times what chance would")
-    if cause.share > 0.0:
+    # No other record tells what each has for itself.
+    if cause.share > 0.0 and not (cause.of_run and len(diagnosis.records) > 1):
         said.append(
             f"without it {100 * min(cause.share, 1.0):.0f}% of what was wrong comes back, on data that were not used"
         )
@@ -211,9 +212,13 @@ def _number_words(cause: Cause, number: str) -> str:
     """Return one number of a cause with its standard error, of each record where each has its own."""
     each = [size for size in cause.sizes if size.number == number]
     values = ", ".join(
-        f"{s.value:.4g} +/- {s.standard_error:.2g}" if np.isfinite(s.standard_error) else f"{s.value:.4g}" for s in each
+        f"{s.value:.4g}"
+        + (f" +/- {s.standard_error:.2g}" if np.isfinite(s.standard_error) else "")
+        + _spaced(s.unit)
+        + (f" in {s.record}" if s.record is not None else "")
+        for s in each
     )
-    return f"{number} {values}{_spaced(each[0].unit)}"
+    return f"{number} {values}"
 
 
 def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
