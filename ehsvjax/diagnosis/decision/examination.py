@@ -1,5 +1,6 @@
 """What the causes that were found leave: is it innocent, is it chance, does the bank lack what is missing?"""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -72,6 +73,9 @@ def examine(selection: Selection) -> Examination:
     chance, chance_behind = _random_force(selection, before, innocent)
     if chance is not None:
         selection, after, innocent = selection.without_causes(), before, True
+    elif innocent:
+        # Then all of it tells of the noise, and more than what lies outside all responses.
+        selection = replace(selection, noise=noise_of_all_left(bench, selection.final))
     instead = _instead(selection, before, innocent)
     return Examination(
         selection, before, after, innocent, undecided and repeated is None, chance, chance_behind, *instead
