@@ -1,6 +1,6 @@
 """The one currency: noise variances by which explanations differ, what chance can do to them, how sure that makes one.
 
-Every threshold of a decision stands here.
+The thresholds by which explanations are named, told apart, and priced stand here.
 """
 
 from collections.abc import Callable, Sequence

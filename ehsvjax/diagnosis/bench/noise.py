@@ -1,4 +1,4 @@
-"""The noise of records that a model does not explain yet: spikes, lattices, and correlated noise told from misfit.
+"""The noise of records that a model does not explain yet: correlated noise told from misfit, and what gains count in.
 
 A residual is noise and misfit together. What candidate causes could have done lies in the space of their responses, so
 that noise is judged by what is left of the residual outside that space: a model's misfit is then not taken for coloured

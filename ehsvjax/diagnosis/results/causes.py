@@ -1,6 +1,6 @@
 """The causes as a person sees them: how sure, how large, what share of the misfit, in which records; what is left."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +44,7 @@ class Cause(NamedTuple):
         gain: variances of what is left by which the records are explained worse without it.
         records: names of those that are.
         contradicted_by: names of records that are explained better without it.
-        of_run: whether it goes by the clock: a property of these runs, absent in any other.
+        of_run: whether each record has its own: a property of these runs, absent in any other.
 
     """
 
@@ -69,22 +69,23 @@ def causes_of(selection: Selection, verdict: Verdict, chance: ProcessNoise | Non
         extended: the fit of the model with the causes.
 
     """
+    errors = _standard_errors(selection) if selection.included else {}
     return tuple(
         _unmodelled(selection, name, group[name], chance) if position is None
-        else _cause(selection, position, name, group[name], extended)
+        else _cause(selection, position, name, group[name], extended, errors)
         for group, position in zip(verdict.groups, verdict.included, strict=True)
         for name in [next(iter(group))]
     )  # fmt: skip
 
 
-def _cause(selection: Selection, position: int, name: str, probability: float, extended: Fit) -> Cause:
+def _cause(selection: Selection, position: int, name: str, probability: float, extended: Fit, errors) -> Cause:
     bench, k = selection.bench, selection.included.index(position)
     candidate, need = bench.candidates[position], selection.needs[k]
     said = [record.name for record in bench.records]
     return Cause(
         name=name,
         signal=candidate.signal,
-        sizes=_sizes(selection, position, extended),
+        sizes=_sizes(selection, position, extended, errors),
         probability=probability,
         share=_share(selection, k),
         gain=need.gain,
@@ -116,14 +117,12 @@ def _share(selection: Selection, k: int) -> float:
     return (without - with_all) / removable if removable > 0.0 and np.isfinite(without) else float("nan")
 
 
-def _sizes(selection: Selection, position: int, extended: Fit) -> tuple[Size, ...]:
-    bench = selection.bench
-    candidate, errors = bench.candidates[position], _standard_errors(selection)
-    found = []
+def _sizes(selection: Selection, position: int, extended: Fit, errors: Mapping[int, float]) -> tuple[Size, ...]:
+    bench, found = selection.bench, []
+    candidate = bench.candidates[position]
     for number, column in bench.unknowns_of(candidate):
         name, named = candidate.parameter(number.name), bench.problem.names[column]
-        own = named != name
-        record = int(named.rpartition("[")[2].rstrip("]")) if own else None
+        record = int(named.rpartition("[")[2].rstrip("]")) if named != name else None
         value = extended.parameters[name] if record is None else extended.records[record].constants[name]
         found.append(
             Size(number.name, value, errors.get(column, float("nan")), extended.model.parameter(name).unit,
@@ -184,8 +183,3 @@ def how_sure(probability: float) -> str:
     if probability >= 0.99:
         return "certain"
     return f"{100 * probability:.0f}%"
-
-
-def names_of(causes: Sequence[Cause]) -> tuple[str, ...]:
-    """Return the names."""
-    return tuple(cause.name for cause in causes)

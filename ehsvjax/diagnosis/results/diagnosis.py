@@ -9,7 +9,7 @@ from ehsvjax.diagnosis.decision.search import Integration
 from ehsvjax.diagnosis.decision.verdict import Alternative
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
-from ehsvjax.diagnosis.results.causes import Cause, Left, names_of
+from ehsvjax.diagnosis.results.causes import Cause, Left
 from ehsvjax.diagnosis.results.gain import Gain
 from ehsvjax.diagnosis.results.misfit import Misfit
 from ehsvjax.effects import BANK
@@ -82,7 +82,7 @@ class Diagnosis:
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the causes."""
-        return names_of(self.causes)
+        return tuple(cause.name for cause in self.causes)
 
     @property
     def left(self) -> Left:
