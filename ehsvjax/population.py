@@ -20,9 +20,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Float
 
 from ehsvjax import kernels
+from ehsvjax.holds import HOLDS, continued
 from ehsvjax.models.model import Equations, Model, Parameter, identity
 from ehsvjax.record import Record
-from ehsvjax.simulate import Grid, constants_of, grid_of, input_array, scan_model, straight_inputs
+from ehsvjax.simulate import Grid, constants_of, grid_of, holds_of, input_array, scan_model
 
 # Samples whose squares are added up plainly before the sum is added to the rest.
 _SUMMED_TOGETHER = 64
@@ -31,15 +32,15 @@ _SUMMED_TOGETHER = 64
 class Samples(NamedTuple):
     """Records side by side, padded at the end to the longest; `measured` is False where there is no sample.
 
-    `straight` is 1 where an input runs straight to its next value, 0 where it is held. `constants` are the parameters
-    that are known in some record, by name; NaN in the others.
+    `holds` are places in `holds.HOLDS`, of what each input does between samples. `constants` are the parameters that
+    are known in some record, by name; NaN in the others.
     """
 
     inputs: Float[Any, "record time input"]
     outputs: Float[Any, "record time signal"]
     measured: Bool[Any, "record time signal"]
     sample_period: Float[Any, " record"]
-    straight: Float[Any, "record input"]
+    holds: Float[Any, "record input"]
     constants: dict[str, Float[Any, " record"]]
 
 
@@ -131,28 +132,26 @@ def stack_records(model: Model, records: Sequence[Record]) -> tuple[Samples, Gri
     """
     longest = max(len(record) for record in records)
 
-    def padded(array, fill):
-        return np.pad(array, ((0, longest - len(array)), (0, 0)), constant_values=fill)
-
     def measured(record):
         absent = np.full(len(record), np.nan)
-        return np.stack([record.outputs.get(name, absent) for name in observed], axis=-1)
+        outputs = np.stack([record.outputs.get(name, absent) for name in observed], axis=-1)
+        return np.pad(outputs, ((0, longest - len(record)), (0, 0)), constant_values=np.nan)
 
     observed = observed_outputs(model, records)
     constants = [constants_of(model, record) for record in records]
-    stacked = np.stack([padded(measured(record), np.nan) for record in records])
+    stacked = np.stack([measured(record) for record in records])
     samples = Samples(
-        inputs=np.stack([padded(input_array(model, record), 0.0) for record in records]),
+        inputs=np.stack([continued(input_array(model, record), longest) for record in records]),
         outputs=np.nan_to_num(stacked, nan=0.0),
         measured=np.isfinite(stacked),
         sample_period=np.array([record.sample_period for record in records]),
-        straight=np.array([straight_inputs(model, record) for record in records]),
+        holds=np.array([holds_of(model, record) for record in records]),
         constants={
             name: np.array([c.get(name, np.nan) for c in constants]) for name in sorted(set().union(*constants))
         },
     )
     grids = [grid_of(model, record) for record in records]
-    return samples, Grid(max(grid.substeps for grid in grids), any(grid.straight for grid in grids))
+    return samples, Grid(max(grid.substeps for grid in grids), max((grid.hold for grid in grids), key=HOLDS.index))
 
 
 def coordinates_of(parameters: Sequence[Parameter]) -> Coordinates:
@@ -344,7 +343,7 @@ def _scan(problem: Problem, parameters, own, samples: Samples, visit, carry, res
         carry,
         rest,
         scan,
-        samples.straight,
+        samples.holds,
     )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ehsvjax.checks import as_number, flag, instance, refused, shown
 from ehsvjax.columns import Column, pick, unknown_name, vector
+from ehsvjax.holds import WORDS, interpolated
 from ehsvjax.matlab import mat_table
 from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
 from ehsvjax.record_checks import (
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     import pandas
 
 Hold = str | Mapping[str, str]
-"""What inputs do between samples, "zero" or "linear": one for all, or by name; those that are not named are held."""
+"""What inputs do between samples, one of `holds.HOLDS` for all, or by name; those that are not named are held."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,11 +45,12 @@ class Record:
         time: time stamps `[time]` in s, increasing and, unless `uniform=False`, uniform: rounding or jitter of up to
             1 % of a period passes.
         inputs: name -> values `[time]`. With `hold="zero"` an input is held from time[k] to time[k+1], with
-            `hold="linear"` it is interpolated.
+            `hold="linear"` it runs straight to the next value, with `hold="band-limited"` it is the smooth curve that
+            its samples fix, as behind a generator's or an amplifier's reconstruction filter (`ehsvjax.holds`).
         outputs: name -> values `[time]`, sample k taken at time[k]. NaN is a missing sample and carries no weight.
             May be empty, for a record that is only simulated.
-        hold: what the inputs do between samples, "zero" or "linear". By name where they differ: {"reference": "linear",
-            "pulse": "zero"}; those that are not named are held.
+        hold: what the inputs do between samples, "zero", "linear" or "band-limited". By name where they differ:
+            {"reference": "linear", "pulse": "zero"}; those that are not named are held.
         name: what the record is called in print and in legends.
         uniform: False admits non-uniform time, for a record that is then resampled: `sample_period` refuses it.
         constants: name of a model's parameter -> its value, SI, where it is known for this record and may be another in
@@ -104,7 +106,7 @@ class Record:
         return self.duration / (len(self) - 1)
 
     def hold_of(self, name: str) -> str:
-        """Say what one input does between samples, "zero" or "linear"."""
+        """Say what one input does between samples: "zero", "linear" or "band-limited"."""
         return self.hold.get(name, "zero") if isinstance(self.hold, Mapping) else self.hold
 
     def slice(self, start: float = -math.inf, stop: float = math.inf) -> "Record":
@@ -138,17 +140,18 @@ class Record:
         """Put the record on a uniform grid from its first time stamp on.
 
         Inputs follow their hold: zero-order hold takes the last value at or before the new time (2 % of a
-        step early counts as at it, so that rounding delays nothing), linear interpolates. Outputs are
-        interpolated linearly; a missing neighbour makes a missing sample. There is **no anti-aliasing**: before
-        going to a coarser grid, low-pass the outputs yourself.
+        step early counts as at it, so that rounding delays nothing), linear interpolates, and so does a band-limited
+        one, by its smooth curve, where the time stamps are uniform. Outputs are interpolated linearly; a missing
+        neighbour makes a missing sample. There is **no anti-aliasing**: before going to a coarser grid, low-pass the
+        outputs yourself.
 
         A step of the time stamps longer than two usual ones (their median; half a one more, for jitter) is a gap.
         Nothing is known of the outputs there, they are missing samples; nor of the inputs, which cannot be missing, so
         that the gap is refused unless `inputs_known_in_gaps` says that they kept to their hold there too, as a command
         does that is logged when it changes.
 
-        Raises ValueError for a gap in the inputs, and unless the period (s) is positive, at most the record's duration
-        and not so short that there were more than 10^8 samples.
+        Raises ValueError for a gap in the inputs, for a band-limited input whose time is not uniform, and unless the
+        period (s) is positive, at most the record's duration and not so short that there were more than 10^8 samples.
         """
         if not 0.0 < (as_number(sample_period) or 0.0) <= self.duration:
             raise ValueError(
@@ -161,6 +164,11 @@ class Record:
                 "more than 1e8 samples, is the period in s?"
             )
         flag("inputs_known_in_gaps", inputs_known_in_gaps)
+        if not self.uniform and any(self.hold_of(name) == "band-limited" for name in self.inputs):
+            raise ValueError(
+                f"cannot resample {self.name!r}: the smooth curve of a band-limited input is known from uniform "
+                "samples only; resample it with hold='linear' and declare the hold of the result"
+            )
         gaps = _gaps(self.time)
         if self.inputs and gaps.any() and not inputs_known_in_gaps:
             raise ValueError(_unknown_inputs(self.name, self.time, gaps))
@@ -169,11 +177,10 @@ class Record:
         stamps = np.linspace(0.0, self.duration, len(self)) if self.uniform else self.time - self.time[0]
         place = np.round(np.interp(grid, stamps, np.arange(len(self))), 6)  # in samples
         unknown = (place % 1 > 0) & np.append(gaps, False)[place.astype(int)]
-        between = {"zero": _hold_last, "linear": _interpolate}
         return replace(
             self,
             time=self.time[0] + grid,
-            inputs={name: between[self.hold_of(name)](values, place) for name, values in self.inputs.items()},
+            inputs={name: _between(values, place, self.hold_of(name)) for name, values in self.inputs.items()},
             outputs={
                 name: np.where(unknown, np.nan, _interpolate(values, place)) for name, values in self.outputs.items()
             },
@@ -345,12 +352,11 @@ class Record:
 
     def _held(self) -> str:
         """Say in words what the inputs do between samples."""
-        words = {"zero": "zero-order hold", "linear": "linear hold"}
         by_hold: dict[str, list[str]] = {}
         for name in self.inputs:
-            by_hold.setdefault(words[self.hold_of(name)], []).append(name)
+            by_hold.setdefault(WORDS[self.hold_of(name)], []).append(name)
         if len(by_hold) < 2:
-            return next(iter(by_hold), words["zero"])
+            return next(iter(by_hold), WORDS["zero"])
         return ", ".join(f"{hold} of {' and '.join(names)}" for hold, names in by_hold.items())
 
     def _span(self) -> str:
@@ -392,8 +398,11 @@ def _unknown_inputs(name: str, time: np.ndarray, gaps: np.ndarray) -> str:
     )
 
 
-def _hold_last(values: np.ndarray, place: np.ndarray) -> np.ndarray:
-    return values[np.floor(place + TOLERANCE).astype(int)]
+def _between(values: np.ndarray, place: np.ndarray, hold: str) -> np.ndarray:
+    """Return an input at places that are counted in samples."""
+    if hold == "zero":
+        return values[np.floor(place + TOLERANCE).astype(int)]
+    return _interpolate(values, place) if hold == "linear" else interpolated(values, place)
 
 
 def _interpolate(values: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -8,16 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.checks import by_name, choice, flag, instance, number, shown
+from ehsvjax.holds import HOLDS
 
 # Share of a period by which a time stamp may be off the uniform grid through the first and the last one.
 # Stamps within 1 % of any straight line always keep to it, as the grid is then itself off by at most 1 %.
 TOLERANCE = 0.02
 # Seconds, 30,000 years: what is beyond is no time in s but one counted in ms, us or ns since 1970.
 _LATEST = 1e12
-
-
-HOLDS = ("zero", "linear")
-"""What an input does between samples: it stays, or runs straight to the next value."""
 
 
 def checked_hold(hold: Any, inputs: Collection[str]) -> Any:

@@ -13,6 +13,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ehsvjax.checks import by_name, function, instance, number, whole
+from ehsvjax.holds import HOLDS, between, course
 from ehsvjax.integrators import repeated, scan_samples
 from ehsvjax.models.check import check_equations, where_not_finite
 from ehsvjax.models.model import Equations, Model, identity
@@ -27,12 +28,12 @@ class Grid(NamedTuple):
 
     Attributes:
         substeps: integration steps per sample period.
-        straight: whether any input runs straight from sample to sample.
+        hold: the last of `holds.HOLDS` that any input has.
 
     """
 
     substeps: int
-    straight: bool
+    hold: str
 
 
 def simulate(
@@ -80,7 +81,7 @@ def simulate(
             as_scalars(start),
             jnp.asarray(inputs),
             jnp.float64(record.sample_period),
-            jnp.asarray(straight_inputs(model, record)),
+            jnp.asarray(holds_of(model, record)),
         )
     found = {name: np.asarray(outputs[name]) for name in model.outputs}
     if not all(np.isfinite(series[:2]).all() for series in found.values()):
@@ -125,7 +126,7 @@ def constants_of(model: Model, record: Record) -> dict[str, float]:
 
 
 def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
-    """Return the steps per sample that the model's `max_step` asks for, and whether inputs are straight.
+    """Return the steps per sample that the model's `max_step` asks for, and what inputs do between samples.
 
     Raises:
         ValueError: for substeps that are not a positive whole number, or so many that a simulation would take minutes.
@@ -140,7 +141,7 @@ def grid_of(model: Model, record: Record, substeps: int | None = None) -> Grid:
             f"expected at most {_MOST_STEPS:g} integration steps, got {len(record)} samples of {substeps:.3g} each: "
             f"take fewer substeps, or a longer max_step of {model.name} ({model.max_step} s)"
         )
-    return Grid(int(substeps), any(record.hold_of(name) == "linear" for name in record.inputs))
+    return Grid(int(substeps), max((record.hold_of(name) for name in record.inputs), key=HOLDS.index, default="zero"))
 
 
 def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]:
@@ -160,12 +161,12 @@ def input_array(model: Model, record: Record) -> Float[np.ndarray, "time input"]
     return np.array([record.inputs[name] for name in model.inputs], float).reshape(len(model.inputs), len(record)).T
 
 
-def straight_inputs(model: Model, record: Record) -> Float[np.ndarray, " input"]:
-    """Return 1 for every input that runs straight from sample to sample, 0 for one that is held; in the model's order.
+def holds_of(model: Model, record: Record) -> Float[np.ndarray, " input"]:
+    """Return the place in `holds.HOLDS` of what every input does between samples, in the model's order.
 
     What the record does not hold is held.
     """
-    return np.array([float(record.hold_of(name) == "linear") for name in model.inputs])
+    return np.array([float(HOLDS.index(record.hold_of(name))) for name in model.inputs])
 
 
 def scan_model(
@@ -180,13 +181,13 @@ def scan_model(
     carry: Any,
     samples: Any,
     scan: Callable = lax.scan,
-    straight: Float[Array, " input"] | None = None,
+    holds: Float[Array, " input"] | None = None,
 ):
     """Visit each sample of one trajectory: `visit(carry, outputs, sample) -> (carry, kept)`.
 
     Args:
         equations: the model's.
-        grid: steps per sample, and whether any input is straight between them.
+        grid: steps per sample, and what inputs do between samples.
         signal: what every named signal passes through.
         parameters: scalars by name.
         initial: scalars by name.
@@ -196,8 +197,7 @@ def scan_model(
         carry: what `visit` accumulates.
         samples: pytree of arrays `[time, ...]`, of which `visit` sees a slice.
         scan: `lax.scan`, or what does the same.
-        straight: 1 for each input that runs straight from sample to sample, 0 for one that is held; None: all as the
-            grid says.
+        holds: of each input its place in `holds.HOLDS`; None: all as the grid says.
 
     Returns:
         the last carry, and what was kept, stacked `[time, ...]`.
@@ -205,23 +205,18 @@ def scan_model(
     """
     if equations.prepare is not None:
         inputs = equations.prepare(parameters, inputs, sample_period)
-    following = inputs
-    if grid.straight:
-        following = jnp.concatenate([inputs[1:], inputs[-1:]])
-        following = following if straight is None else jnp.where(straight > 0.0, following, inputs)
+    periods = course(inputs, holds, grid.hold)
 
     def named(row):
         return dict(zip(equations.inputs, row, strict=True))
 
     def inputs_of(sample):
-        now, then, _ = sample
-        if not grid.straight:
-            return lambda fraction: named(now)
-        return lambda fraction: named(now + fraction * (then - now))
+        here, _ = sample
+        return lambda fraction: named(between(here, fraction))
 
     def visit_state(carry, state, sample):
-        now, _, rest = sample
-        return visit(carry, equations.measure(parameters, state, named(now), signal), rest)
+        here, rest = sample
+        return visit(carry, equations.measure(parameters, state, named(here[0]), signal), rest)
 
     step = equations.stepper(parameters, sample_period / grid.substeps, signal)
     state = equations.start(parameters, initial, named(inputs[0]))
@@ -229,7 +224,7 @@ def scan_model(
     # stays one.
     state = jax.tree.map(lambda leaf: leaf if _is_count(leaf) else jnp.asarray(leaf, inputs.dtype), state)
     step = repeated(step, grid.substeps)
-    return scan_samples(step, state, visit_state, carry, (inputs, following, samples), inputs_of, scan)
+    return scan_samples(step, state, visit_state, carry, (periods, samples), inputs_of, scan)
 
 
 def _is_count(leaf) -> bool:
@@ -237,11 +232,11 @@ def _is_count(leaf) -> bool:
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _simulate(equations, grid, signal, parameters, initial, inputs, sample_period, straight):
+def _simulate(equations, grid, signal, parameters, initial, inputs, sample_period, holds):
     def keep(carry, outputs, sample):
         return carry, outputs
 
     _, outputs = scan_model(
-        equations, grid, signal, parameters, initial, inputs, sample_period, keep, None, None, straight=straight
+        equations, grid, signal, parameters, initial, inputs, sample_period, keep, None, None, holds=holds
     )
     return outputs

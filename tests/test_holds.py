@@ -126,8 +126,8 @@ def test_a_hold_by_name_is_kept_and_printed(tmp_path):
     ("hold", "said"),
     [
         ({"psuh": "linear"}, "expected the names of inputs in hold, push, pull; got 'psuh': mind the spelling"),
-        ({"push": "cubic"}, "expected the hold of push to be 'zero' or 'linear', got 'cubic'"),
-        ("first", "expected hold to be 'zero' or 'linear', got 'first'"),
+        ({"push": "cubic"}, "expected the hold of push to be 'zero', 'linear' or 'band-limited', got 'cubic'"),
+        ("first", "expected hold to be 'zero', 'linear' or 'band-limited', got 'first'"),
     ],
 )
 def test_another_hold_is_refused(hold, said):

@@ -95,7 +95,7 @@ REFUSED = [
         "use .filled(numpy.nan)"),
     ({"inputs": {"position": COMMAND}}, "signal 'position' is both an input and an output", "rename one"),
     ({"inputs": {"time": COMMAND}}, "'time' cannot be one of the inputs", "rename the signal"),
-    ({"hold": "first"}, "expected hold to be 'zero' or 'linear'", "got 'first'"),
+    ({"hold": "first"}, "expected hold to be 'zero', 'linear' or 'band-limited'", "got 'first'"),
 ]
 # fmt: on
 

@@ -131,11 +131,11 @@ def test_no_step_is_longer_than_the_models(period, substeps):
 @pytest.mark.parametrize(("period", "substeps"), [(1e-3, 4), (0.5e-3, 2), (0.25e-3, 1), (1e-4, 1), (0.9e-3, 4)])
 def test_default_steps_of_the_servovalve(period, substeps):
     record = Record(period * np.arange(1001), {"command": np.zeros(1001)})
-    assert grid_of(servovalve(), record) == (substeps, False)
+    assert grid_of(servovalve(), record) == (substeps, "zero")
 
 
 def test_the_hold_is_the_records():
-    assert grid_of(INTEGRATOR, record_of([0.0, 1.0], hold="linear"), 7) == (7, True)
+    assert grid_of(INTEGRATOR, record_of([0.0, 1.0], hold="linear"), 7) == (7, "linear")
 
 
 @pytest.mark.parametrize("substeps", [1, 2, 8])
