@@ -54,14 +54,14 @@ def silverbox() -> Rig:
         table = table - table.mean()
         u, y = (table[column].to_numpy()[first:last] for column in ("u_V", "y_V"))
         return ehsvjax.Record(
-            np.arange(len(u)) / 610.35, {"voltage": u}, {"position": y}, name=name, hold="linear"
+            np.arange(len(u)) / 610.35, {"voltage": u}, {"position": y}, name=name, hold="band-limited"
         )  # fmt: skip
 
     return Rig(
         real_models.silverbox(),
         (record("multisine_1", 0, 3000), record("multisine_3", 0, 3000)),
         (record("arrow", 0, 38_500),),
-        ("cubic_stiffness", "input_hold", "transport_delay", "feedthrough_of_voltage"),
+        ("cubic_stiffness", "quadratic_stiffness"),
         ("cubic_stiffness",),
         {},
     )
