@@ -21,6 +21,8 @@ from ehsvjax.unknowns import guess_noise_variance
 
 # Share of an output's variance below which a model explains nothing of it, and from which a change would explain it.
 _NOTHING, _MOST = 0.1, 0.5
+# Share by which another sign or unit has to explain more than what was given, before any fit.
+_BETTER = 0.3
 # Residuals of at most this many variances of white noise leave nothing to explain.
 _NOISE = 2.0
 # Integration steps between two samples over which what a model does is long over.
@@ -44,6 +46,24 @@ def about_steps(model: Model, records: Sequence[Record]) -> tuple[str, ...]:
         for record in records
         if (substeps := grid_of(model, record).substeps) > _STEPS
     )
+
+
+def about_record(model: Model, record: Record, name: str) -> tuple[float, str]:
+    """Return how well a model can mean an output before any fit, and what would let it mean more, "" if nothing does.
+
+    With nominal values: the share of the output's variance that a straight line of the simulated one explains, which
+    bears with a gain and an offset but not with another sign, another unit of time or of an input.
+    """
+    start = {p.name: p.value for p in model.initial}
+    share, slope, _ = _straight(record, simulate(model, record, model.nominal, start), name)
+    others = [_Trial(share, f"the opposite sign of {name}, or of {', '.join(model.inputs)},")] if slope < 0 else []
+    share = share if slope > 0 else 0.0
+    for changed, words in _other_records(model, record, name):
+        explained, slope, _ = _straight(changed, simulate(model, changed, model.nominal, start), name)
+        others += [_Trial(explained, words)] if slope > 0 else []
+    best = max(others, key=lambda trial: round(trial.share, 2), default=_Trial(0.0, ""))
+    better = best.share > max(_MOST, share + _BETTER)
+    return share, f"{best.words} would explain {best.share:.0%}" if better else ""
 
 
 def about_fit(

@@ -85,6 +85,30 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     return figure
 
 
+def plot_record(record: Record) -> "matplotlib.figure.Figure":
+    """Draw every signal of a record over time, inputs as they run between samples; what is missing is marked below."""
+    signals = {**record.inputs, **record.outputs}
+    with _style():
+        figure = _figure(width=9.0, height=0.6 + 1.5 * len(signals))
+        figure.suptitle(_plain(record.name), x=0.01, ha="left", fontweight="bold")
+        rows = figure.subplots(len(signals), 1, squeeze=False)[:, 0]
+        for axes, (name, values) in zip(rows, signals.items(), strict=True):
+            if name in record.inputs:
+                held = "steps-post" if record.hold_of(name) == "zero" else "default"
+                axes.plot(record.time, values, color=_COMMAND, drawstyle=held, lw=1.0)
+            else:
+                axes.plot(record.time, values, color=_MEASURED, ls="none", marker=".", ms=2.5, rasterized=True)
+            missing = record.time[~np.isfinite(values)]
+            if len(missing):
+                axes.plot(missing, np.zeros(len(missing)), "|", color=_MODEL, transform=axes.get_xaxis_transform(),
+                          label=f"{len(missing)} missing")  # fmt: skip
+                _legend(axes)
+            axes.set_ylabel(_words(name))
+        _share_time(rows, record)
+        figure.align_ylabels()
+    return figure
+
+
 def plot_identification(
     fits: Fit | Sequence[Fit],
     noise_free: Mapping[str, Float[np.ndarray, " time"]] | Sequence[Mapping[str, Float[np.ndarray, " time"]]] = (),
@@ -281,7 +305,7 @@ def _share_time(axes, record: Record) -> None:
     for upper in axes[:-1]:
         upper.sharex(axes[-1])
         upper.tick_params(labelbottom=False)
-    axes[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1] + record.sample_period))
+    axes[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1] + record.duration / (len(record) - 1)))
 
 
 def _scaled(values, unit: str) -> tuple[float, str]:

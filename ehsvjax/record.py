@@ -28,7 +28,11 @@ from ehsvjax.record_checks import (
 )
 
 if TYPE_CHECKING:
+    import matplotlib.figure
     import pandas
+
+    from ehsvjax.inspection import Inspection
+    from ehsvjax.models.model import Model
 
 Hold = str | Mapping[str, str]
 """What inputs do between samples, one of `holds.HOLDS` for all, or by name; those that are not named are held."""
@@ -186,6 +190,44 @@ class Record:
             },
             uniform=True,
         )
+
+    def within(self, **ranges: Any) -> "Record":
+        """Mark readings at or beyond the ends of a sensor's range as missing: `within(position=(-0.1, 0.194))`.
+
+        A reading at the end of a sensor is no measurement. Ends are in SI units; one that there is not is infinite.
+        Raises ValueError for a name that is no output, or ends that are not in order.
+        """
+        outputs = dict(self.outputs)
+        for name, ends in ranges.items():
+            if name not in outputs:
+                raise ValueError(f"expected outputs of {self.name!r} ({', '.join(outputs) or 'none'}), got {name!r}")
+            pair = tuple(ends) if isinstance(ends, Sequence) and not isinstance(ends, str) else ()
+            if len(pair) != 2 or None in map(as_number, pair) or not pair[0] < pair[1]:
+                raise ValueError(f"expected the ends of {name} as a pair (low, high), got {shown(ends)}")
+            outputs[name] = np.where((outputs[name] > pair[0]) & (outputs[name] < pair[1]), outputs[name], np.nan)
+        return replace(self, outputs=outputs)
+
+    def check(self, model: "Model | None" = None) -> "Inspection":
+        """Look at the record before any fit: a line for each signal, passed or not, with what to do.
+
+        Ends of sensors, signals that stand still, steps of a lattice, readings that stand alone or are missing, levels
+        and band of the inputs; and with a model whether it can mean the record at all: its names, its time, its signs
+        and units. Print it, or let a notebook show it.
+
+        Raises ValueError for a model that is none.
+        """
+        from ehsvjax.inspection import inspected
+        from ehsvjax.models.model import Model
+
+        if model is not None:
+            instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
+        return inspected(self, model)
+
+    def plot(self) -> "matplotlib.figure.Figure":
+        """Draw every input and output over time; missing readings are marked below."""
+        from ehsvjax.plots import plot_record
+
+        return plot_record(self)
 
     def select(self, *, outputs: Sequence[str]) -> "Record":
         """Keep the named outputs only, in the order given, and all inputs; ValueError for an unknown name."""

@@ -30,6 +30,16 @@ def summary_html(fit: Fit) -> str:
     return f'<div style="max-width: 60em">{"".join(_html_table(section) for section in _sections(fit))}</div>'
 
 
+def model_summary(model: Model) -> str:
+    """Return a model's parameters with bounds, initial conditions and signals as text, SI units."""
+    return "\n".join(line for section in _model_sections(model) for line in _text_lines(section))
+
+
+def model_summary_html(model: Model) -> str:
+    """Return `model_summary` as an HTML fragment, as `summary_html` does for a fit."""
+    return f'<div style="max-width: 60em">{"".join(_html_table(section) for section in _model_sections(model))}</div>'
+
+
 def precision_summary(precision: Precision) -> str:
     """Return parameters with standard errors, correlations and what is not fixed, as text."""
     rows = [
@@ -90,6 +100,22 @@ def _sections(fit: Fit) -> Iterator[_Section]:
         yield _initial_section(fit)
     if not first:
         yield _warnings(fit)
+
+
+def _model_sections(model: Model) -> Iterator[_Section]:
+    yield _Section("Model", [*_model_rows(model), ("longest step", _seconds(model.max_step))])
+    head = ("name", "symbol", "value", "unit", "bounds")
+    for title, parameters in (("Parameters", model.parameters), ("Initial conditions", model.initial)):
+        if parameters:
+            yield _Section(title, [_unfitted_row(parameter) for parameter in parameters], head)
+    yield _Section("Signals", [tuple(signal) for signal in model.signals], ("name", "kind", "unit"))
+
+
+def _unfitted_row(parameter: Parameter) -> tuple[str, ...]:
+    bounds = f"{parameter.lower:.6g} .. {parameter.upper:.6g}"
+    if parameter.fixed:
+        bounds = "(fixed, certain)" if parameter.certain else "(fixed)"
+    return parameter.name, parameter.symbol, f"{parameter.value:.6g}", parameter.unit, bounds
 
 
 def _warnings(fit: Fit) -> _Section:

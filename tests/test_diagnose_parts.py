@@ -9,12 +9,12 @@ from scipy.stats import chi2, norm
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, corrected, probabilities, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise, surely_gained
-from ehsvjax.diagnosis.bench.readings import lattice, spikes
 from ehsvjax.diagnosis.hypotheses.curves import _all_waves, knots_along, single_waves
 from ehsvjax.diagnosis.hypotheses.dependence import _log_of_chi_square
 from ehsvjax.diagnosis.results.gain import _gain
 from ehsvjax.diagnosis.results.suspects import _least_size
 from ehsvjax.precision.residual_noise import ResidualNoise
+from ehsvjax.readings import lattice, spikes
 
 
 def series(values):

@@ -5,6 +5,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+import ehsvjax
 from ehsvjax.precision.residual_noise import ResidualNoise
 from ehsvjax.precision.standard_errors import _worth
 from ehsvjax.summary import percent_of_fit, summary, summary_html
@@ -211,3 +212,19 @@ def _noise(coefficients, variance=1.0):
 )
 def test_what_samples_tell_under_coloured_noise_is_a_number_that_can_be_meant(coefficient, words):
     assert _worth(_noise([coefficient]), 0.01, 500) == words
+
+
+def test_a_model_is_printed_as_tables():
+    text = str(ehsvjax.servovalve(open_loop=True))
+    rows = [line.split() for line in text.splitlines()]
+    assert ["signals", "command", "->", "position,", "spool,", "load_pressure"] in rows
+    assert ["dead_zone", "d", "0.0001", "m", "5e-05", "..", "0.00015"] in rows
+    assert ["mass", "M", "20", "kg", "(fixed)"] in rows
+    assert ["initial_position", "x(0)", "0", "m", "-0.2", "..", "0.2"] in rows
+    assert ["load_friction", "friction", "N"] in rows
+    assert max(map(len, text.splitlines())) < 100
+
+
+def test_a_model_is_shown_as_tables_whose_names_are_escaped():
+    html = replace(ehsvjax.van_der_pol(), name="<oscillator>")._repr_html_()
+    assert html.count("<table") == 4 and "&lt;oscillator&gt;" in html and "<oscillator>" not in html

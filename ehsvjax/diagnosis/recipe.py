@@ -10,7 +10,6 @@ from jaxtyping import Array, Bool, Key
 from ehsvjax.checks import flag
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.progress import bar as progress_bar
-from ehsvjax.diagnosis.bench.readings import spikes
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.examination import Examination, examine, remaining_term
@@ -28,6 +27,7 @@ from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
 from ehsvjax.fit import Fit
 from ehsvjax.population import stack_records
+from ehsvjax.readings import spikes
 from ehsvjax.record import Record, checked_records
 from ehsvjax.simulate import input_array
 

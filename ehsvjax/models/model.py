@@ -170,6 +170,17 @@ class Model:
         if self.prepare is not None:
             function(f"prepare of {self.name}", self.prepare, "prepare(parameters, inputs, sample_period) -> inputs")
 
+    def __str__(self) -> str:
+        """Tables of the parameters, the initial conditions and the signals."""
+        from ehsvjax.summary import model_summary
+
+        return model_summary(self)
+
+    def _repr_html_(self) -> str:
+        from ehsvjax.summary import model_summary_html
+
+        return model_summary_html(self)
+
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs."""

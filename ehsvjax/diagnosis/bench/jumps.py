@@ -12,9 +12,9 @@ import numpy as np
 
 from ehsvjax.arithmetic import LEFT_OUT, few
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.readings import standing_out
 from ehsvjax.diagnosis.bench.refits import Refits, bounds_of
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
+from ehsvjax.readings import standing_out
 
 # Standard errors of the unknowns over which a jump is looked for: of many jumps a third lie beyond one of them. And
 # deviations of the noise by which a reading may bend over them, more than its neighbours.

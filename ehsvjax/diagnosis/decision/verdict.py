@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, probabilities
-from ehsvjax.diagnosis.bench.readings import lattice
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.examination import Examination
 from ehsvjax.diagnosis.decision.search import Need, Selection
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
+from ehsvjax.readings import lattice
 
 QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"

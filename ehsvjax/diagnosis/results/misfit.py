@@ -5,11 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ehsvjax.diagnosis.bench.readings import lattice
 from ehsvjax.diagnosis.decision.examination import Examination
 from ehsvjax.diagnosis.hypotheses.curves import knots_along
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence
 from ehsvjax.precision.residual_noise import residual_noise
+from ehsvjax.readings import lattice
 
 _BINS = 12
 _WINDOWS = 20
