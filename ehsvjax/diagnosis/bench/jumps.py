@@ -19,6 +19,8 @@ from ehsvjax.readings import standing_out
 # Standard errors of the unknowns over which a jump is looked for: of many jumps a third lie beyond one of them. And
 # deviations of the noise by which a reading may bend over them, more than its neighbours.
 _ERRORS, _STRAIGHT = 3.0, 0.3
+# Times as many steps that tell what a jump looks like.
+_FINER = 4
 
 
 def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
@@ -48,7 +50,9 @@ def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
     outputs = bench.simulated(points)
     forward, backward = np.split(outputs[1:], 2)
     deviations = np.sqrt(noise.innovation_variances)[:, None]
-    bent = np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0) / deviations
+    # Steps smear a jump over their length: what comes before the next reading looks smooth, and shorter ones move it.
+    smeared = np.max(np.abs(bench.simulated(points, substeps=_FINER * int(bench.problem.substeps)) - outputs), axis=0)
+    bent = np.maximum(np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0), smeared) / deviations
     # More than the others: the first reading of a bend that begins bends less.
     alone = [standing_out(bent[..., i], _STRAIGHT) for i in range(bent.shape[-1])]
     jumping = samples.measured & np.stack(alone, axis=-1)
