@@ -355,6 +355,20 @@ class Fit:
 
         return plot_fit(self, self.records[0] if record is None else record)
 
+    def plot_residuals(self, record: Record | None = None):
+        """Draw what is left: its correlations with itself and with every input, with bands, its values, its power.
+
+        Args:
+            record: by default the first that was fitted.
+
+        Raises:
+            ValueError: for a record without outputs, or on which the simulation fails.
+
+        """
+        from ehsvjax.plots import plot_residuals
+
+        return plot_residuals(self, self.records[0] if record is None else record)
+
     def __str__(self) -> str:
         """Return a summary in lmfit's manner: statistics, parameters with units, warnings."""
         from ehsvjax.summary import summary

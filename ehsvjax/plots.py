@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.correlations import Correlation, with_input, with_itself
 from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.precision.standard_errors import quantile_of
@@ -40,6 +41,9 @@ _STYLE = {
     "legend.fontsize": 9,
     "lines.linewidth": 1.4,
 }
+
+# Samples by which residuals are compared with themselves and with inputs.
+_LAGS = 25
 
 _PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
 
@@ -82,6 +86,57 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
         if searched:
             _draw_search(rows[-1], fit)
         figure.align_ylabels()
+    return figure
+
+
+def plot_residuals(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
+    """Draw what a fit leaves of each output: its correlations with itself and with every input, its values, its power.
+
+    The bands hold 99% of the correlations that noise alone would show. Correlated noise leaves the first band and not
+    the others; a model that is wrong leaves those too.
+
+    Args:
+        fit: whose model is simulated.
+        record: one that was fitted, or a new one, whose initial conditions are then estimated first.
+
+    Raises:
+        ValueError: if the record lacks an input, holds no output, or the simulation fails.
+
+    """
+    from scipy.signal import welch
+    from scipy.stats import norm
+
+    if not checked_record(record).outputs:
+        raise ValueError(f"expected {record.name} to hold an output to draw, got none: use fit.simulate(record)")
+    left = fit.residuals(record)
+    failed = [name for name, residual in left.items() if np.isinf(residual).any()]
+    if failed:
+        raise ValueError(
+            f"the simulation of {', '.join(failed)} is not finite on {record.name}: nothing is left to draw"
+        )
+    lags = min(_LAGS, len(record) // 4)
+    with _style():
+        figure = _figure(width=2.9 * (3 + len(record.inputs)), height=0.5 + 2.6 * len(left))
+        figure.suptitle(
+            _plain(f"{fit.model.name}: what is left of {record.name}"), x=0.01, ha="left", fontweight="bold"
+        )
+        rows = figure.subplots(len(left), 3 + len(record.inputs), squeeze=False)
+        for axes, (name, residual) in zip(rows, left.items(), strict=True):
+            factor, label = _scaled(residual, fit.model.unit(name))
+            _draw_correlation(axes[0], with_itself(residual, lags), "with itself")
+            axes[0].set_ylabel(f"{_words(name)}\ncorrelation")
+            for below, (driving, values) in zip(axes[1:], record.inputs.items(), strict=False):
+                _draw_correlation(below, with_input(residual, values, lags), f"with {_words(driving)}")
+            there = residual[np.isfinite(residual)] / factor
+            axes[-2].hist(there, bins="auto", density=True, color=_MEASURED)
+            places = np.linspace(there.min(), there.max(), 200)
+            axes[-2].plot(places, norm.pdf(places, there.mean(), there.std() or 1.0), color=_MODEL)
+            axes[-2].set(title="its values", xlabel=f"residual {label}", yticks=[])
+            filled = np.nan_to_num(residual - np.nanmean(residual)) / factor
+            frequencies, power = welch(filled, 1.0 / record.sample_period, nperseg=min(len(filled), 512))
+            axes[-1].loglog(frequencies[1:], power[1:], color=_MEASURED)
+            axes[-1].axhline(2.0 * record.sample_period * float(np.mean(filled**2)), color=_MODEL, ls=(0, (4, 3)))
+            axes[-1].set(title="its power, and that of white noise", xlabel="frequency (Hz)")
     return figure
 
 
@@ -280,6 +335,14 @@ def _draw_residual(axes, time, residual, unit: str, band: "Band | None" = None) 
     axes.set_ylabel(f"residual\n{label}")
     if band is not None:
         _legend(axes)
+
+
+def _draw_correlation(axes, found: Correlation, title: str) -> None:
+    outside = np.abs(found.values) > found.band
+    axes.axhspan(-found.band, found.band, color=_MODEL, alpha=0.12, lw=0)
+    axes.vlines(found.lags, 0.0, found.values, colors=np.where(outside, _MODEL, _MEASURED), lw=1.6)
+    axes.axhline(0.0, color=_AXIS, lw=0.8)
+    axes.set(title=title, xlabel="lag (samples)")
 
 
 def _draw_search(axes, fit: Fit) -> None:
