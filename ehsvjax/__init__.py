@@ -16,6 +16,7 @@ conditions included), generation, time (a sample), signal (an output). SI units 
 
 from ehsvjax import effects, excitation, hydraulics, operators
 from ehsvjax.columns import Column
+from ehsvjax.comparison import compare
 from ehsvjax.diagnosis import diagnose
 from ehsvjax.effects import Effect
 from ehsvjax.fit import Fit
@@ -36,6 +37,7 @@ __all__ = [
     "Parameter",
     "Record",
     "Signal",
+    "compare",
     "cramer_rao_bound",
     "design",
     "diagnose",

@@ -140,6 +140,27 @@ def plot_residuals(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     return figure
 
 
+def plot_comparison(fits: Mapping[str, Fit], records: Sequence[Record]) -> "matplotlib.figure.Figure":
+    """Draw the outputs of records, measured and as several fits simulate them, a row for each record and output."""
+    pairs = [(record, output) for record in records for output in record.outputs]
+    with _style():
+        figure = _figure(width=9.0, height=0.4 + 2.6 * len(pairs))
+        rows = figure.subplots(len(pairs), 1, squeeze=False)[:, 0]
+        for axes, (record, output) in zip(rows, pairs, strict=True):
+            unit = next(iter(fits.values())).model.unit(output)
+            factor, label = _scaled(record.outputs[output], unit)
+            axes.plot(record.time, record.outputs[output] / factor, color=_MEASURED, ls="none", marker=".", ms=2.5,
+                      label="measured", rasterized=True)  # fmt: skip
+            for i, (name, fit) in enumerate(fits.items()):
+                percent = percent_of_fit(fit.score(record).fit_percent[output])
+                axes.plot(record.time, fit.simulate(record)[output] / factor, color=f"C{i}", lw=1.1,
+                          label=_plain(f"{name}: {percent}"))  # fmt: skip
+            axes.set(title=_plain(record.name), ylabel=f"{_words(output)}\n{label}", xlabel="time (s)")
+            axes.legend(loc="best")
+        figure.align_ylabels()
+    return figure
+
+
 def plot_record(record: Record) -> "matplotlib.figure.Figure":
     """Draw every signal of a record over time, inputs as they run between samples; what is missing is marked below."""
     signals = {**record.inputs, **record.outputs}
