@@ -223,9 +223,7 @@ def duration_of(records: Sequence[Record]) -> float:
 
 def prepared(bench: Workbench) -> Workbench:
     """Return the bench at the step that the nominal model needs, and at the one at which its trials are sketched."""
-    noise_variance, outputs_at = bench.problem.noise_variance, bench.stepped(bench.nominal[None])
-    rough = arithmetic.arithmetic(bench.problem, outputs_at, noise_variance, arithmetic.ROUGHLY)
-    return replace(settled(bench, outputs_at, noise_variance), sketched_at=rough.substeps)
+    return settled(bench, bench.stepped(bench.nominal[None]), bench.problem.noise_variance)
 
 
 def settled(
@@ -233,10 +231,15 @@ def settled(
 ) -> Workbench:
     """Return the bench at a step at which its simulations (`stepped`) are as good as exact; itself if it is there.
 
-    Readings that no such step knows are no longer measured.
+    Readings that no such step knows are no longer measured. The step at which trials are sketched, where most readings
+    are as good as exact, follows too: with other parameters a model may be stiff, and a sketch of it chatter.
     """
+    sketched = replace(bench.problem, substeps=np.int32(bench.sketched_at))
+    rough = arithmetic.arithmetic(sketched, outputs_at, noise_variance, arithmetic.ROUGHLY)
     problem = arithmetic.settled(bench.problem, outputs_at, noise_variance)
-    return bench if problem is bench.problem else replace(bench, problem=problem)
+    if problem is bench.problem and rough.substeps == bench.sketched_at:
+        return bench
+    return replace(bench, problem=problem, sketched_at=rough.substeps)
 
 
 def _filled(rows, count):
