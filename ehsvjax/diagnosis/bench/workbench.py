@@ -235,7 +235,8 @@ def settled(
     are as good as exact, follows too: with other parameters a model may be stiff, and a sketch of it chatter.
     """
     sketched = replace(bench.problem, substeps=np.int32(bench.sketched_at))
-    rough = arithmetic.arithmetic(sketched, outputs_at, noise_variance, arithmetic.ROUGHLY)
+    # Beside what is wrong with the fit, whatever the noise is found to be.
+    rough = arithmetic.arithmetic(sketched, outputs_at, bench.problem.noise_variance, arithmetic.ROUGHLY)
     problem = arithmetic.settled(bench.problem, outputs_at, noise_variance)
     if problem is bench.problem and rough.substeps == bench.sketched_at:
         return bench
