@@ -20,8 +20,9 @@ from ehsvjax.precision.residual_noise import (
 
 # Directions of the candidates' responses below this share of the largest are counted as noise.
 _NEGLIGIBLE = 1e-3
-# Rounds of an estimate of coloured noise at most, and the share by which the last one changes it.
-_ROUNDS, _SETTLED = 100, 1e-3
+# Rounds of an estimate of coloured noise at most, the share by which the last one changes it, and the share of the
+# change before that each may have.
+_ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
 # Of a record, between which an explanation's gain may differ.
 _PARTS = 20
 
@@ -225,16 +226,20 @@ def noise_outside(
     noises = {
         c: _white(float(np.sum(left[c] ** 2)) / max(float(of(measured, c).sum()) - taken[c], 1.0)) for c in channels
     }
-    whole = {c: float(np.sum(of(standardised, c) ** 2)) / max(float(of(measured, c).sum()), 1.0) for c in channels}
     # What the projection took of the noise depends on the noise, first taken to be white. Of slow noise most lies
     # inside the space: each round finds a part of what the last one missed.
-    for _ in range(_ROUNDS):
+    last = dict.fromkeys(channels, np.inf)
+    for count in range(_ROUNDS):
         before = noises
         inside = np.sum([meat(basis[c], noise) for c, noise in noises.items()], axis=0)
         absorbed = {c: absorbed_by_the_fit(basis[c], of(measured, c), noise, inside) for c, noise in noises.items()}
         found = {c: residual_noise(left[c], of(measured, c), "auto", absorbed[c], taken[c]) for c in channels}
-        # Misfit outside the space may look like noise that no round has enough of: it is never more than the residual.
-        noises = {c: noises[c] if _at_most(noises[c], whole[c]) else found[c] for c in channels}
+        # What does not settle, round by round, is misfit outside the space that looks like ever slower noise.
+        changes = {c: abs(found[c].variance - noises[c].variance) for c in channels}
+        followed = {c: changes[c] <= _SETTLING * last[c] for c in channels}
+        noises = {c: found[c] if followed[c] else noises[c] for c in channels}
+        if count:  # the first was that from white noise to coloured
+            last = {c: changes[c] if followed[c] else 0.0 for c in channels}
         if all(_alike(noises[c], before[c]) for c in channels):
             break
 
@@ -245,11 +250,6 @@ def noise_outside(
         )  # fmt: skip
 
     return Noise(tuple(tuple(in_units(k, i) for i in range(signals)) for k in range(records)), measured)
-
-
-def _at_most(noise: ResidualNoise, whole: float) -> bool:
-    """Whether coloured noise is as much as the whole residual."""
-    return len(noise.coefficients) > 0 and noise.variance >= whole
 
 
 def _alike(noise: ResidualNoise, before: ResidualNoise) -> bool:
