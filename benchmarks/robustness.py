@@ -21,7 +21,7 @@ import pandas as pd
 
 import ehsvjax
 from benchmarks.diagnosis import VARIANCES, base
-from benchmarks.processes import rows_of
+from benchmarks.processes import rows_of, said
 from ehsvjax.diagnosis import Diagnosis, diagnose
 from tests.hidden_plants import effect_sizes
 from tests.hidden_records import Hidden, records
@@ -42,9 +42,7 @@ def trials_of(effects: int, seed: int) -> list[Hidden]:
 
 def answer_of(found: Diagnosis) -> set[frozenset[str]]:
     """Return the names of a diagnosis, each with those that could be there instead."""
-    groups = [frozenset(map(base, a.causes)) for a in found.alternatives]
-    alone = [frozenset([base(name)]) for name in found.names if not any(base(name) in group for group in groups)]
-    return {*groups, *alone}
+    return {frozenset(map(base, group)) for group in said(found)["probabilities"]}
 
 
 def compared(first: Diagnosis, again: Diagnosis) -> str:
@@ -68,10 +66,10 @@ def tried(trials: list[Hidden]) -> list[dict[str, Any]]:
         record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
         fit = fitted(record, 0)
         first = diagnose(fit, record, key=jax.random.key(0), progress=False)
-        facts = {"model": hidden.model, "hidden": hidden.names[0], "seed": hidden.seed, "first": said(first)}
+        facts = {"model": hidden.model, "hidden": hidden.names[0], "seed": hidden.seed, "first": in_words(first)}
 
         def row(change, outcome, found, facts=facts):
-            rows.append(facts | {"change": change, "outcome": outcome, "said": said(found)})
+            rows.append(facts | {"change": change, "outcome": outcome, "said": in_words(found)})
 
         for key in range(1, 1 + KEYS):
             again = diagnose(fit, record, key=jax.random.key(key), progress=False)
@@ -101,7 +99,7 @@ def of_half(hidden: Hidden, whole: Diagnosis, half: Diagnosis) -> str:
     return "what the whole says too" if all(group & everything for group in answer_of(half)) else "another name"
 
 
-def said(found: Diagnosis) -> str:
+def in_words(found: Diagnosis) -> str:
     """Return the verdict and the names in one line."""
     return " and ".join(" or ".join(sorted(group)) for group in answer_of(found)) or found.verdict
 

@@ -21,8 +21,8 @@ class Correlation(NamedTuple):
 
 def with_itself(residual: Float[np.ndarray, " time"], lags: int, level: float = 0.99) -> Correlation:
     """Return the autocorrelation of a residual at 1 to `lags`, with the band of white noise; NaN is missing."""
-    after = np.arange(1, lags + 1)
-    values = np.array([_correlation(residual, residual, int(lag)) for lag in after])
+    after, standard = np.arange(1, lags + 1), _standardised(residual)
+    values = np.array([_mean_product(standard, standard, int(lag)) for lag in after])
     return Correlation(after.astype(float), values, quantile_of(level) / np.isfinite(residual).sum() ** 0.5)
 
 
@@ -34,17 +34,20 @@ def with_input(
     A residual after the input (lag above 0) is dynamics that the model lacks; one before it is feedback, or a delay
     that the model has too much of. Both may be correlated in themselves, which widens the band (Bartlett 1935).
     """
-    every = np.arange(-lags, lags + 1)
-    values = np.array([_correlation(residual, driving, int(lag)) for lag in every])
+    every, left, drive = np.arange(-lags, lags + 1), _standardised(residual), _standardised(driving)
+    values = np.array([_mean_product(left, drive, int(lag)) for lag in every])
     reach = min(_BAND_LAGS, len(residual) // 4)
-    products = [_correlation(residual, residual, k) * _correlation(driving, driving, k) for k in range(1, reach + 1)]
+    products = [_mean_product(left, left, k) * _mean_product(drive, drive, k) for k in range(1, reach + 1)]
     variance = max(1.0 + 2.0 * float(np.sum(products)), 1.0) / float(np.isfinite(residual).sum())
     return Correlation(every.astype(float), values, quantile_of(level) * variance**0.5)
 
 
-def _correlation(after: np.ndarray, before: np.ndarray, lag: int) -> float:
-    """Return the correlation of one series with another, `lag` samples before it."""
-    after, before = ((series - np.nanmean(series)) / (np.nanstd(series) or 1.0) for series in (after, before))
+def _standardised(series: np.ndarray) -> np.ndarray:
+    return (series - np.nanmean(series)) / (np.nanstd(series) or 1.0)
+
+
+def _mean_product(after: np.ndarray, before: np.ndarray, lag: int) -> float:
+    """Return the correlation of one standardised series with another, `lag` samples before it."""
     if lag < 0:
         after, before, lag = before, after, -lag
     pairs = after[lag:] * before[: len(before) - lag]

@@ -152,8 +152,9 @@ def plot_comparison(fits: Mapping[str, Fit], records: Sequence[Record]) -> "matp
             axes.plot(record.time, record.outputs[output] / factor, color=_MEASURED, ls="none", marker=".", ms=2.5,
                       label="measured", rasterized=True)  # fmt: skip
             for i, (name, fit) in enumerate(fits.items()):
-                percent = percent_of_fit(fit.score(record).fit_percent[output])
-                axes.plot(record.time, fit.simulate(record)[output] / factor, color=f"C{i}", lw=1.1,
+                initial = fit.initial_of(record)  # of a new record a fit of its own
+                percent = percent_of_fit(fit.score(record, initial).fit_percent[output])
+                axes.plot(record.time, fit.simulate(record, initial)[output] / factor, color=f"C{i}", lw=1.1,
                           label=_plain(f"{name}: {percent}"))  # fmt: skip
             axes.set(title=_plain(record.name), ylabel=f"{_words(output)}\n{label}", xlabel="time (s)")
             axes.legend(loc="best")

@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.signal import lsim
 
 import ehsvjax
 from ehsvjax.holds import HOLDS, interpolated
-from tests.small_models import DAMPING, MASS, STIFFNESS, carriage
+from tests.small_models import DAMPING, carriage, carriage_plant
 
 PERIOD, COUNT = 0.1, 200
 TIME = np.arange(COUNT) * PERIOD
@@ -26,8 +25,7 @@ def multisine(time, highest=0.65, seed=0):
 
 def carried(push, time):
     """Return position and velocity [time, 2] of the carriage, exactly, of a push that is straight between times."""
-    system = [[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]], [[0.0], [1.0 / MASS]], np.eye(2), np.zeros((2, 1))
-    return lsim(system, push, time)[1]
+    return carriage_plant(push, time[1], straight=True)
 
 
 @settings(deadline=None)

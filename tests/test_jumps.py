@@ -102,9 +102,6 @@ def test_a_reading_just_behind_a_jump_that_the_steps_smear_carries_no_weight():
     point = bench.nominal.copy()
     truth = to_unit(bench.problem.coordinates, np.array([model.nominal.get(n, 0.0) for n in bench.problem.names]))
     point[bench.base_columns] = truth[bench.base_columns]
-    point[bench.column["initial_position[0]"]] = to_unit(bench.problem.coordinates, np.zeros(len(truth)))[
-        bench.column["initial_position[0]"]
-    ]
     current = refit(bench, point[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
     dropped = bench.problem.samples.measured & ~without_jumps(bench, current, noise).problem.samples.measured
     assert behind in np.flatnonzero(dropped[0, :, 1]) and dropped[0, :, 1].sum() < 12
