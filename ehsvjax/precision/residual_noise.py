@@ -63,7 +63,7 @@ def residual_noise(
 
     """
     count = int(measured.sum())
-    covariance = _autocovariance(residuals, residuals, measured, lags_tried(count))
+    covariance = autocovariance(residuals, measured)
     covariance = covariance if absorbed is None else covariance + absorbed
     # Where a share s was taken, correlations vary by 1/(1 - s) more than those of as many samples as are left.
     count = max(int(count * (1.0 - taken / max(count, 1)) ** 2), 1)
@@ -116,10 +116,7 @@ def absorbed_by_the_fit(
 
     """
     through = np.where(measured[..., None], _correlated(basis, noise), 0.0)
-    lags = lags_tried(int(measured.sum()))
-    return _autocovariance(basis, through, measured, lags) + _autocovariance(
-        through - basis @ inside, basis, measured, lags
-    )
+    return _products(basis, through, measured) + _products(through - basis @ inside, basis, measured)
 
 
 def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
@@ -134,14 +131,27 @@ def _ljung_box(covariance: Float[np.ndarray, " lag"], count: int) -> float:
     return float(chdtrc(lags, statistic))
 
 
-def lags_tried(count: int) -> int:
+def _lags_tried(count: int) -> int:
     """Return the lags worth estimating: 10 log10(n), as usual, but at most an eighth of the samples."""
     return int(max(1, min(_LAGS * 2, 10 * np.log10(max(count, 2)), count // 8)))
 
 
-def _autocovariance(first, second, measured, lags: int) -> Float[np.ndarray, " lag"]:
-    """Return the mean product of two sequences, the second later by 0 to `lags`; zero where nothing is measured."""
-    length = measured.shape[1]
+def autocovariance(
+    series: Float[np.ndarray, "record time *sequence"], measured: Bool[np.ndarray, "record time"]
+) -> Float[np.ndarray, " lag"]:
+    """Return the mean product of a series and itself later, summed over the sequences, for the lags worth estimating.
+
+    Args:
+        series: zero where nothing is measured.
+        measured: where there is a sample.
+
+    """
+    return _products(series, series, measured)
+
+
+def _products(first, second, measured) -> Float[np.ndarray, " lag"]:
+    """Return the mean product of two sequences, the second later by each lag; zero where nothing is measured."""
+    length, lags = measured.shape[1], _lags_tried(int(measured.sum()))
     # Slices in time are then in one piece, and are multiplied where they lie.
     first, second = np.ascontiguousarray(first), np.ascontiguousarray(second)
     covariance = []

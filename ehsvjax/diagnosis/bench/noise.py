@@ -5,7 +5,7 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,16 +13,17 @@ from jaxtyping import Bool, Float, Int
 
 from ehsvjax.precision.residual_noise import (
     ResidualNoise,
-    absorbed_by_the_fit,
+    autocovariance,
     meat,
     residual_noise,
 )
 
 # Directions of the candidates' responses below this share of the largest are counted as noise.
 _NEGLIGIBLE = 1e-3
-# Rounds of an estimate of coloured noise at most, the share by which the last one changes it, and the share of the
-# change before that each may have.
-_ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
+# Rounds of an estimate of coloured noise at most, and the share by which the last one changes it.
+_ROUNDS, _SETTLED = 100, 1e-3
+# Times the mean square of the whole residual that the variance of noise is at most, chance included.
+_AT_MOST = 2.0
 # Of a record, between which an explanation's gain may differ.
 _PARTS = 20
 
@@ -57,7 +58,7 @@ class Noise(NamedTuple):
         for i, k in np.ndindex(self.measured.shape[-1], self.measured.shape[0]):
             noise, whitened = self.of[k][i], series[..., k, :, i]
             order = len(noise.coefficients)
-            if order:
+            if order and whitened.size:
                 first = whitened[..., :order] @ _first_innovations(noise).T
                 whitened = lfilter(np.concatenate([[1.0], -noise.coefficients]), 1.0, whitened, axis=-1)
                 whitened[..., :order] = first
@@ -205,51 +206,73 @@ def noise_outside(
         responses: of all that may have acted: the model's sensitivities, the candidates' responses.
 
     """
-    records, signals = _channels(measured)
     # An output that a record does not hold has no noise there.
-    channels = [(k, i) for k, i in np.ndindex(records, signals) if measured[k, :, i].any()]
-    deviation = np.ones((records, 1, signals))
+    channels = [(k, i) for k, i in np.ndindex(*_channels(measured)) if measured[k, :, i].any()]
+    deviation = np.ones(_channels(measured))
     for k, i in channels:
-        deviation[k, 0, i] = _deviation(residual[k, :, i][measured[k, :, i]])
-    standardised = np.where(measured, residual, 0.0) / deviation
-
-    def of(series, channel):
-        k, i = channel
-        return series[k : k + 1, ..., i]
-
-    directions = _basis(np.where(measured, responses, 0.0) / deviation)
-    basis = {c: of(directions, c).copy() for c in channels}
-    coefficients = np.sum([np.tensordot(of(standardised, c), basis[c], 2) for c in channels], axis=0)
-    left = {c: of(standardised, c) - basis[c] @ coefficients for c in channels}
+        deviation[k, i] = _deviation(residual[k, :, i][measured[k, :, i]])
+    standardised = np.where(measured, residual, 0.0) / deviation[:, None]
+    basis = _basis(np.where(measured, responses, 0.0) / deviation[:, None])
+    left = standardised - _combined(basis, np.tensordot(standardised.swapaxes(1, 2), basis, 3))
     # Directions that were taken of each output, a share of one where it is in several.
-    taken = {c: float(np.vdot(basis[c], basis[c])) for c in channels}
+    taken = {(k, i): float(np.vdot(basis[k, i], basis[k, i])) for k, i in channels}
     noises = {
-        c: _white(float(np.sum(left[c] ** 2)) / max(float(of(measured, c).sum()) - taken[c], 1.0)) for c in channels
+        (k, i): _white(float(np.sum(left[k, :, i] ** 2)) / max(float(measured[k, :, i].sum()) - taken[k, i], 1.0))
+        for k, i in channels
     }
-    # What the projection took of the noise depends on the noise, first taken to be white. Of slow noise most lies
-    # inside the space: each round finds a part of what the last one missed.
-    last = dict.fromkeys(channels, np.inf)
-    for count in range(_ROUNDS):
-        before = noises
-        inside = np.sum([meat(basis[c], noise) for c, noise in noises.items()], axis=0)
-        absorbed = {c: absorbed_by_the_fit(basis[c], of(measured, c), noise, inside) for c, noise in noises.items()}
-        found = {c: residual_noise(left[c], of(measured, c), "auto", absorbed[c], taken[c]) for c in channels}
-        # What does not settle, round by round, is misfit outside the space that looks like ever slower noise.
-        changes = {c: abs(found[c].variance - noises[c].variance) for c in channels}
-        followed = {c: changes[c] <= _SETTLING * last[c] for c in channels}
-        noises = {c: found[c] if followed[c] else noises[c] for c in channels}
-        if count:  # the first was that from white noise to coloured
-            last = {c: changes[c] if followed[c] else 0.0 for c in channels}
+    # What was taken of the noise depends on the noise, first taken to be white. Of slow noise most lies inside the
+    # space: each round finds a part of what the last one missed. Misfit that the space does not hold looks like slow
+    # noise too, until that would be more than there is: what lies outside the space is then followed no further in.
+    first, refuted = None, set()
+    for _ in range(_ROUNDS):
+        before, found = noises, _completed(_of(noises, measured), basis, left, taken)
+        first = first or found
+        refuted |= {c for c in channels if not found[c].variance <= _AT_MOST}
+        noises = {c: first[c] if c in refuted else found[c] for c in channels}
         if all(_alike(noises[c], before[c]) for c in channels):
             break
+    return _of({c: _times(noise, deviation[c] ** 2) for c, noise in noises.items()}, measured)
 
-    def in_units(k, i):
-        noise, square = noises.get((k, i), _white(1.0)), deviation[k, 0, i] ** 2
-        return noise._replace(
-            variance=noise.variance * square, innovation_variance=noise.innovation_variance * square
-        )  # fmt: skip
 
-    return Noise(tuple(tuple(in_units(k, i) for i in range(signals)) for k in range(records)), measured)
+def _of(noises: Mapping[tuple[int, int], ResidualNoise], measured) -> Noise:
+    """Return the noise of channels `(record, signal)`."""
+    records, signals = _channels(measured)
+    return Noise(
+        tuple(tuple(noises.get((k, i), _white(1.0)) for i in range(signals)) for k in range(records)), measured
+    )  # fmt: skip
+
+
+def _times(noise: ResidualNoise, square: float) -> ResidualNoise:
+    return noise._replace(variance=noise.variance * square, innovation_variance=noise.innovation_variance * square)
+
+
+def _completed(
+    noise: Noise,
+    basis: Float[np.ndarray, "record signal time direction"],
+    left: Float[np.ndarray, "record time signal"],
+    taken: Mapping[tuple[int, int], float],
+) -> dict[tuple[int, int], ResidualNoise]:
+    """Return the noise of each channel in `taken`, from what is left of it and what was taken, as a noise tells it.
+
+    By generalised least squares and its covariance: a step of restricted maximum likelihood (Patterson & Thompson 1971,
+    "Recovery of inter-block information when block sizes are unequal"; Dempster, Laird & Rubin 1977, "Maximum
+    likelihood from incomplete data via the EM algorithm"). Only readings whose innovation is known tell anything.
+    """
+    known, innovations = noise.known, noise.innovations(np.moveaxis(basis, (3, 1), (0, 3)))
+    information, turned = np.linalg.eigh(innovations @ innovations.T)
+    told = information > _NEGLIGIBLE**2 * np.max(information, initial=0.0)
+    root = turned[:, told] / np.sqrt(information[told])
+    whole = np.where(known, left - _combined(basis, root @ (root.T @ (innovations @ noise.innovations(left)))), 0.0)
+
+    def completed(k, i):
+        here, unsure = known[k : k + 1, :, i], np.where(known[k, :, i, None], basis[k, i] @ root, 0.0)
+        return residual_noise(whole[k : k + 1, :, i], here, "auto", autocovariance(unsure[None], here), taken[k, i])
+
+    return {(k, i): completed(k, i) for k, i in taken}
+
+
+def _combined(basis, coefficients) -> Float[np.ndarray, "record time signal"]:
+    return (basis @ coefficients).swapaxes(1, 2)
 
 
 def _alike(noise: ResidualNoise, before: ResidualNoise) -> bool:
@@ -268,7 +291,7 @@ def surely_gained(
     return min(gains, key=abs) if len({gain > 0.0 for gain in gains}) == 1 else 0.0
 
 
-def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
+def _basis(responses) -> Float[np.ndarray, "record signal time direction"]:
     """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples."""
     shape = responses.shape[1:]
     flat = responses.reshape(len(responses), -1)
@@ -279,7 +302,7 @@ def _basis(responses) -> Float[np.ndarray, "record time direction signal"]:
     order = np.argsort(-squares)[: flat.shape[1] // 2]
     kept = order[squares[order] > _NEGLIGIBLE**2 * np.max(squares, initial=0.0)]
     vectors = (combinations[:, kept] / np.sqrt(squares[kept])).T @ flat
-    return np.moveaxis(vectors.reshape(-1, *shape), 0, 2)
+    return np.ascontiguousarray(vectors.reshape(-1, *shape).transpose(1, 3, 2, 0))
 
 
 def _deviation(values) -> float:
