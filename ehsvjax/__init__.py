@@ -9,6 +9,7 @@ The pipeline, each step usable by itself:
     fit.precision(); fit.profile_likelihood()        how sure it is (`precision`); before any data: `design`
     diagnosis = diagnose(fit, record, key=...)       what it gets wrong and why (`diagnose`), of all known `effects`
     print(diagnosis); diagnosis.extended             the cause, and the fit of the model that has it
+    diagnosis.next_experiment(Limits(...), key=...)  the record that tells what this one cannot (`experiment`)
 
 Axes, wherever a shape is given: record, individual (a candidate of the population), parameter (an unknown, initial
 conditions included), generation, time (a sample), signal (an output). SI units throughout.
@@ -19,6 +20,7 @@ from ehsvjax.columns import Column
 from ehsvjax.comparison import compare
 from ehsvjax.diagnosis import diagnose
 from ehsvjax.effects import Effect
+from ehsvjax.experiment import Limits, next_experiment
 from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators
 from ehsvjax.identify import identify
@@ -32,6 +34,7 @@ __all__ = [
     "Column",
     "Effect",
     "Fit",
+    "Limits",
     "Model",
     "Operators",
     "Parameter",
@@ -45,6 +48,7 @@ __all__ = [
     "excitation",
     "hydraulics",
     "identify",
+    "next_experiment",
     "operators",
     "runge_kutta_4",
     "servovalve",

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from ehsvjax.correlations import Correlation, with_input, with_itself
 from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
+from ehsvjax.models.model import Model
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.record import Record, checked_record
 from ehsvjax.summary import NOT_FINITE, percent_of_fit
@@ -78,7 +79,7 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
             unit = fit.model.unit(name)
             axes, below = signals[2 * i : 2 * i + 2]
             axes.set_title(
-                _plain(f"fit {percent_of_fit(score.fit_percent[name])}, rmse {_quantity(score.rmse[name], unit)}")
+                _plain(f"fit {percent_of_fit(score.fit_percent[name])}, rmse {quantity(score.rmse[name], unit)}")
             )
             _draw_series(axes, record.time, {"measured": measured, "model": simulated[name]}, name, unit)
             _draw_residual(below, record.time, measured - simulated[name], unit, bands.get(name))
@@ -181,6 +182,47 @@ def plot_record(record: Record) -> "matplotlib.figure.Figure":
                           label=f"{len(missing)} missing")  # fmt: skip
                 _legend(axes)
             axes.set_ylabel(_words(name))
+        _share_time(rows, record)
+        figure.align_ylabels()
+    return figure
+
+
+def plot_experiment(
+    record: Record, model: Model, said: Mapping[str, Mapping[str, Any]], outputs: Sequence[str]
+) -> "matplotlib.figure.Figure":
+    """Draw an experiment that is planned: its inputs, what several models say of each output, and their differences.
+
+    Args:
+        record: inputs.
+        model: for the units.
+        said: name of each model -> output -> `[time]`; the first is what the others are compared with.
+        outputs: those that are drawn.
+
+    """
+    first, *others = said
+    with _style():
+        figure = _figure(width=9.0, height=0.6 + 1.6 * (len(record.inputs) + 2 * len(outputs)))
+        rows = figure.subplots(len(record.inputs) + 2 * len(outputs), 1, squeeze=False)[:, 0]
+        for axes, (name, values) in zip(rows, record.inputs.items(), strict=False):
+            factor, label = _scaled(values, model.unit(name))
+            held = "steps-post" if record.hold_of(name) == "zero" else "default"
+            axes.plot(record.time, values / factor, color=_COMMAND, drawstyle=held, lw=1.0)
+            axes.set_ylabel(f"{_words(name)}\n{label}")
+        for i, output in enumerate(outputs):
+            together, apart = rows[len(record.inputs) + 2 * i :][:2]
+            factor, label = _scaled(np.concatenate([one[output] for one in said.values()]), model.unit(output))
+            for k, (name, one) in enumerate(said.items()):
+                together.plot(record.time, one[output] / factor, color=f"C{k}", lw=1.0, label=_words(name))
+            together.set_ylabel(f"{_words(output)}\n{label}")
+            _legend(together)
+            differences = {name: said[name][output] - said[first][output] for name in others}
+            factor, label = _scaled(np.concatenate(list(differences.values())), model.unit(output))
+            for k, (name, values) in enumerate(differences.items(), 1):
+                apart.plot(
+                    record.time, values / factor, color=f"C{k}", lw=1.0, label=f"{_words(name)} − {_words(first)}"
+                )
+            apart.set_ylabel(f"difference\n{label}")
+            _legend(apart)
         _share_time(rows, record)
         figure.align_ylabels()
     return figure
@@ -409,7 +451,8 @@ def _plain(text: str) -> str:
     return " ".join(text.splitlines()).replace("$", r"\$")
 
 
-def _quantity(value: float, unit: str) -> str:
+def quantity(value: float, unit: str) -> str:
+    """Return a value with its unit, in the prefix that reads best."""
     if not math.isfinite(value):
         return NOT_FINITE
     prefix = _prefix(value, unit)

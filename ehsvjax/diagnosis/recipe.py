@@ -18,6 +18,7 @@ from ehsvjax.diagnosis.decision.verdict import verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
 from ehsvjax.diagnosis.results.causes import causes_of
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
+from ehsvjax.diagnosis.results.explanations import explanations_of
 from ehsvjax.diagnosis.results.extension import as_fit
 from ehsvjax.diagnosis.results.gain import gain_of
 from ehsvjax.diagnosis.results.misfit import misfit_of
@@ -118,6 +119,7 @@ def _diagnosed(
         integration=selection.integration,
         fit=fit,
         records=records,
+        explanations=explanations_of(selection, verdict),
     )
 
 

@@ -231,7 +231,7 @@ def noise_outside(
         noises = {c: first[c] if c in refuted else found[c] for c in channels}
         if all(_alike(noises[c], before[c]) for c in channels):
             break
-    return _of({c: _times(noise, deviation[c] ** 2) for c, noise in noises.items()}, measured)
+    return _of({c: _times(noise, float(deviation[c]) ** 2) for c, noise in noises.items()}, measured)
 
 
 def _of(noises: Mapping[tuple[int, int], ResidualNoise], measured) -> Noise:

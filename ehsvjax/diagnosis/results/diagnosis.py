@@ -1,7 +1,7 @@
 """The result of a diagnosis: verdict, causes, what could be there instead, the extended model, and its gain."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -10,6 +10,7 @@ from ehsvjax.diagnosis.decision.verdict import Alternative
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.causes import Cause, Left
+from ehsvjax.diagnosis.results.explanations import Explanation
 from ehsvjax.diagnosis.results.gain import Gain
 from ehsvjax.diagnosis.results.misfit import Misfit
 from ehsvjax.effects import BANK
@@ -20,6 +21,9 @@ from ehsvjax.record import Record
 
 if TYPE_CHECKING:
     import pandas
+    from jaxtyping import Array, Key
+
+    from ehsvjax.experiment import Limits, Plan
 
 
 class Excluded(NamedTuple):
@@ -54,6 +58,7 @@ class Diagnosis:
         integration: the step that was needed, and what its arithmetic is worth.
         fit: the fit that was diagnosed.
         records: on which.
+        explanations: what these records cannot tell apart, each as a fit: `next_experiment` tells how to.
 
     """
 
@@ -73,6 +78,7 @@ class Diagnosis:
     integration: Integration
     fit: Fit
     records: tuple[Record, ...]
+    explanations: tuple[Explanation, ...] = ()
 
     @property
     def record(self) -> Record:
@@ -114,6 +120,41 @@ class Diagnosis:
         from ehsvjax.diagnosis.results.page import write_page
 
         write_page(self, path)
+
+    def next_experiment(
+        self,
+        limits: "Limits",
+        *,
+        key: "Key[Array, '']",
+        can_change: Mapping[str, tuple[float, float]] | None = None,
+        can_add: Mapping[str, float] | None = None,
+        against: Mapping[str, float] | None = None,
+        generations: int = 20,
+    ) -> "Plan":
+        """Return the experiment that would tell what these records cannot; see `ehsvjax.next_experiment`.
+
+        The four most probable explanations of each cause are told from each other. With `against`, those are left
+        aside: what is told is whether an effect of that size is there, which these records may not show.
+
+        Args:
+            limits: of the inputs, of outputs, of time.
+            key: random key, `jax.random.key(0)`.
+            can_change: name of a constant of the model -> (least, most) that the rig can be set to, SI.
+            can_add: name of an output that could be measured too -> variance of its noise, its unit squared.
+            against: number of an effect -> its size, SI: `{"coulomb_friction.force": 50.0}`; every number of an effect.
+            generations: of the search.
+
+        Raises:
+            ValueError: where there is nothing to tell apart, and as `ehsvjax.next_experiment` does.
+
+        """
+        from ehsvjax.experiment import next_experiment
+        from ehsvjax.experiment.questions import doubts_of, undecided_of
+
+        explanations, pairs = undecided_of(self) if against is None else doubts_of(self, against)
+        return next_experiment(
+            explanations, limits, key=key, can_change=can_change, can_add=can_add, pairs=pairs, generations=generations
+        )
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.

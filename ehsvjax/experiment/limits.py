@@ -1,0 +1,49 @@
+"""What an experiment must keep within: its inputs, what is watched of its outputs, and its length."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from ehsvjax.checks import number, positive
+
+
+class Limits:
+    """Limits of an experiment, SI: `Limits(command=(-5e-3, 5e-3), position=(-0.08, 0.08), duration=10.0)`.
+
+    Attributes:
+        between: name of an input or an output of the model -> (least, most). Every input must have them; outputs keep
+            within theirs in the simulation of every explanation, measured or not.
+        duration: s, of the record; None: as long as the first one so far.
+
+    """
+
+    def __init__(self, *, duration: float | None = None, **between: tuple[float, float]) -> None:
+        """Check the limits.
+
+        Raises:
+            ValueError: for what is no pair of numbers in order, or no time.
+
+        """
+        self.duration = None if duration is None else positive("duration", duration, "give seconds above 0")
+        self.between: Mapping[str, tuple[float, float]] = {n: as_pair(n, pair) for n, pair in between.items()}
+
+    def __repr__(self) -> str:
+        """Return the call that makes them."""
+        given = {**self.between} | ({} if self.duration is None else {"duration": self.duration})
+        return f"Limits({', '.join(f'{name}={value!r}' for name, value in given.items())})"
+
+
+def as_pair(name: str, pair: Any) -> tuple[float, float]:
+    """Return what lies between two numbers.
+
+    Raises:
+        ValueError: for what is no pair of finite numbers, the lower one first.
+
+    """
+    try:
+        lower, upper = pair
+    except (TypeError, ValueError):
+        raise ValueError(f"expected {name} between (least, most), got {pair!r}: give two numbers, SI") from None
+    lower, upper = (number(f"{what} of {name}", value) for what, value in (("least", lower), ("most", upper)))
+    if not lower < upper:
+        raise ValueError(f"expected {name} between (least, most), the lower one first; got ({lower:g}, {upper:g})")
+    return lower, upper

@@ -1,0 +1,332 @@
+"""The recipe of a plan: simulate many experiments under every explanation, search, refit the best few exactly."""
+
+import functools
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from ehsvjax.checks import by_name, instance, several, whole
+from ehsvjax.draws import check_key
+from ehsvjax.experiment import commands
+from ehsvjax.experiment.limits import Limits, as_pair
+from ehsvjax.experiment.plan import Option, Pair, Plan, best_of
+from ehsvjax.experiment.separation import Explained, explained, predicted, refitted_separation, separations
+from ehsvjax.fit import Fit
+from ehsvjax.genetic import Operators
+from ehsvjax.plots import quantity
+from ehsvjax.population import cast
+from ehsvjax.record import Record
+from ehsvjax.search import search
+from ehsvjax.unknowns import checked_variance
+
+_POPULATION = 32
+# Of the limits' range that the simulation of every explanation stays away from them.
+_MARGIN = 0.05
+# What breaks the limits costs this, and more by how far it does.
+_BROKEN = 1e3
+# Simple experiments whose separation is worked out exactly.
+_SIMPLE = 3
+# Genes of the simple ones: every kind at these amplitudes and time scales, in the middle, from fixed levels.
+_AMPLITUDES, _HOLDS = (1.0, 0.5), (0.45, 0.8)
+_PLAIN = np.array([0.03, 0.91, 0.37, 0.66, 0.15, 0.82, 0.47, 0.99, 0.28, 0.72, 0.09, 0.58])
+
+
+class Space(NamedTuple):
+    """What experiments there are: `[input, 2]` limits of the inputs, of each constant that can be changed its two."""
+
+    time: Float[Any, " time"]
+    inputs: Float[Any, "input 2"]
+    constants: dict[str, Float[Any, "2"]]
+
+
+class Question(NamedTuple):
+    """Everything that a separation is computed from: the experiments there are, and the explanations.
+
+    Attributes:
+        space: the experiments.
+        explanations: each made ready.
+        noise_variance: `[signal]` of the outputs; +inf for one that is watched and not measured.
+        watched: `[signal, 2]` limits of the outputs, with their margin.
+        apart: `[true, other]` which explanations are to be told apart.
+
+    """
+
+    space: Space
+    explanations: tuple[Explained, ...]
+    noise_variance: Float[Any, " signal"]
+    watched: Float[Any, "signal 2"]
+    apart: Bool[Any, "true other"]
+
+
+def next_experiment(
+    explanations: Mapping[str, Fit],
+    limits: Limits,
+    *,
+    key: Key[Array, ""],
+    can_change: Mapping[str, tuple[float, float]] | None = None,
+    can_add: Mapping[str, float] | None = None,
+    pairs: Sequence[Pair] | None = None,
+    generations: int = 20,
+) -> Plan:
+    """Return the experiment that tells explanations apart best, within limits that each of them keeps.
+
+    The genetic algorithm of this package searches experiments: kind, size, offset, pace and levels of every input, and
+    the values of constants that can be changed. To first order each is judged by the pair of explanations that it
+    separates worst; the best and a few plain ones are then refitted exactly. A plain one that tells enough is chosen.
+
+    Args:
+        explanations: name -> fit, all to the same records; `Diagnosis.next_experiment` gives those of a diagnosis.
+        limits: of the inputs, of outputs, of time.
+        key: random key, `jax.random.key(0)`.
+        can_change: name of a constant of the model -> (least, most) that the rig can be set to, SI.
+        can_add: name of an output that could be measured too -> variance of its noise, its unit squared. It is asked
+            for only where the experiment tells too little without it.
+        pairs: (true, other) names of explanations that are to be told apart; by default each from every other. Where
+            one contains the other, only the one that says more can be told from it.
+        generations: of the search.
+
+    Raises:
+        ValueError: for fewer than two explanations, fits to different records, an input without limits, a name that the
+            model does not have, or limits, variances and numbers that are none.
+
+    """
+    fits = _checked(explanations, limits)
+    check_key(key)
+    apart = _apart(fits, pairs)
+    first = next(iter(fits.values()))
+    model, so_far = first.model, first.records[0]
+    whole("generations", generations, 1, 1000)
+    changeable = _changeable(can_change, fits)
+    added = {n: checked_variance(model, _output(model, n), v) for n, v in by_name("can_add", can_add, "").items()}
+    variances = {**added, **first.noise_variance}
+    watched = {name: pair for name, pair in limits.between.items() if name in model.outputs}
+    outputs = tuple(name for name in model.outputs if name in variances or name in watched)
+    count = round((limits.duration or so_far.duration) / so_far.sample_period) + 1
+    time = so_far.sample_period * np.arange(count)
+    template = Record(
+        time,
+        {name: np.zeros(count) for name in model.inputs},
+        {name: time for name in outputs},  # stands for readings that are not yet there
+        hold=so_far.hold,
+        constants={**so_far.constants, **{name: first.model.nominal[name] for name in changeable}},
+    )
+    space = Space(
+        time,
+        np.array([limits.between[name] for name in model.inputs]),
+        {name: np.array(pair) for name, pair in changeable.items()},
+    )
+    plan = None
+    for measured in [first.noise_variance, variances] if added else [variances]:
+        noise = {name: measured.get(name, np.inf) for name in outputs}
+        question = Question(
+            space,
+            tuple(explained(fit, [template] * _POPULATION, noise) for fit in fits.values()),
+            np.array(list(noise.values())),
+            np.array([_inside(watched.get(name)) for name in outputs]),
+            np.array([[(a, b) in apart for b in fits] for a in fits]),
+        )
+        plan = _planned(question, fits, apart, template, measured, variances, key, generations)
+        if plan.chosen.probability > 0.99:
+            break
+    assert plan is not None
+    return plan
+
+
+def _planned(question: Question, fits, apart, template: Record, measured, variances, key, generations: int) -> Plan:
+    """Return the plan with some outputs measured."""
+    single = _cast(question, jnp.float32)
+    unknowns = commands.GENES * len(question.space.inputs) + len(question.space.constants)
+    state, _ = search(
+        jax.tree_util.Partial(_cost, single),
+        key,
+        unknowns=unknowns,
+        population=_POPULATION,
+        generations=generations,
+        operators=Operators(),
+        tolerance=0.0,
+    )
+    plain = _plain(question.space)
+    costs = np.concatenate([np.asarray(_judged(single, jnp.asarray(part))) for part in _in_parts(plain)])[: len(plain)]
+    genes = [(np.asarray(state.elites[0], float), False), *((plain[i], True) for i in _best_kinds(plain, costs))]
+
+    def separated(record: Record, names) -> dict[Pair, float]:
+        return {(a, b): refitted_separation(fits[a], fits[b], record, names, variances) for a, b in apart}
+
+    options = []
+    for one, simple in genes:
+        record, words = _experiment(one, template, question.space, fits, measured)
+        options.append(Option(words, record, tuple(measured), separated(record, tuple(measured)), simple))
+    first = next(iter(fits.values()))
+    again, old = replace(first.records[0], outputs={}, name="again"), tuple(first.noise_variance)
+    return Plan(
+        chosen=best_of(options),
+        options=tuple(sorted(options, key=lambda option: -option.least)),
+        same_again=Option("the same experiment again", again, old, separated(again, old), True),
+        today=separated(again, ()),
+        explanations=dict(fits),
+    )
+
+
+def _cost(question: Question, individuals: Float[Array, "experiment gene"]) -> Float[Array, " experiment"]:
+    """Return minus the least separation's logarithm of each experiment; above `_BROKEN` where it breaks the limits."""
+    inputs, constants = _realised(question.space, individuals)
+    every = [predicted(one, inputs, constants) for one in question.explanations]
+    each = [
+        jnp.where(question.apart[a, b], separations(every[a], every[b], question.noise_variance), jnp.inf)
+        for a, b in itertools.permutations(range(len(every)), 2)
+    ]
+    least = jnp.min(jnp.stack(each), axis=0)
+    lower, upper = question.watched.T[:, None, None]
+    beyond = [jnp.max(jnp.maximum(lower - one.outputs, one.outputs - upper), axis=(1, 2)) for one in every]
+    worst = jnp.max(jnp.stack(beyond), axis=0)
+    cost = jnp.where(worst > 0.0, _BROKEN + worst, -jnp.log(jnp.maximum(least, 1e-6)))
+    return jnp.where(jnp.isfinite(least), cost, jnp.inf)
+
+
+_judged = jax.jit(_cost)
+
+
+def _realised(space: Space, individuals):
+    """Return the inputs `[experiment, time, input]` and the constants of each experiment."""
+    size, number = commands.GENES, len(space.inputs)
+
+    def command(genes, limits):
+        return commands.command(genes, space.time, limits[0], limits[1])
+
+    by_input = individuals[:, : size * number].reshape(-1, number, size)
+    inputs = jax.vmap(jax.vmap(command), (0, None))(by_input, space.inputs)
+    rest = individuals[:, size * number :]
+    constants = {n: pair[0] + rest[:, k] * (pair[1] - pair[0]) for k, (n, pair) in enumerate(space.constants.items())}
+    return jnp.moveaxis(inputs, 1, 2), constants
+
+
+def _plain(space: Space) -> Float[np.ndarray, "experiment gene"]:
+    """Return the genes of simple experiments: every kind, all inputs alike, every constant at an end of its range."""
+    found = []
+    ends = itertools.product((0.0, 1.0), repeat=len(space.constants))
+    for values in ends:
+        for kind, amplitude, hold in itertools.product(range(len(commands.KINDS)), _AMPLITUDES, _HOLDS):
+            own = np.concatenate([[(kind + 0.5) / len(commands.KINDS), amplitude, 0.5, hold, 0.5], _PLAIN])
+            found.append(np.concatenate([np.tile(own, len(space.inputs)), values]))
+    return np.array(found)
+
+
+def _in_parts(plain):
+    """Return experiments in populations of one size, the last filled up."""
+    filled = np.concatenate([plain, np.repeat(plain[-1:], -len(plain) % _POPULATION, axis=0)])
+    return np.split(filled.astype(np.float32), len(filled) // _POPULATION)
+
+
+def _best_kinds(plain, costs) -> list[int]:
+    """Return the best few that keep the limits, of different kinds."""
+    best: dict[int, int] = {}
+    for i in np.argsort(costs).tolist():
+        kind = int(plain[i, 0] * len(commands.KINDS))
+        if costs[i] < _BROKEN:
+            best.setdefault(kind, i)
+    return list(best.values())[:_SIMPLE]
+
+
+def _experiment(genes, template: Record, space: Space, fits, measured) -> tuple[Record, str]:
+    """Return an experiment as a record without outputs, and in words."""
+    model = next(iter(fits.values())).model
+    inputs, words = {}, []
+    for k, (name, (lower, upper)) in enumerate(zip(model.inputs, space.inputs, strict=True)):
+        own = genes[k * commands.GENES : (k + 1) * commands.GENES]
+        inputs[name] = commands.realised(own, space.time, lower, upper)
+        in_unit = functools.partial(quantity, unit=model.unit(name))
+        words.append(f"{name}: {commands.described(own, space.time, lower, upper, in_unit)}")
+    rest, constants = genes[len(space.inputs) * commands.GENES :], dict(template.constants)
+    for (name, (lower, upper)), share in zip(space.constants.items(), rest, strict=True):
+        constants[name] = float(lower + share * (upper - lower))
+        words.append(f"{name} {quantity(constants[name], model.parameter(name).unit)}")
+    words.append(f"{space.time[-1]:.4g} s, measure {', '.join(measured)}")
+    return Record(space.time, inputs, hold=template.hold, constants=constants, name="next"), "; ".join(words)
+
+
+def _cast(question: Question, dtype) -> Question:
+    """Return the question with its arrays on the device, in this precision."""
+
+    def converted(tree):
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
+
+    return Question(
+        space=converted(question.space),
+        explanations=tuple(
+            Explained(cast(one.problem, dtype), *converted(one[1:])) for one in question.explanations
+        ),
+        noise_variance=converted(question.noise_variance),
+        watched=converted(question.watched),
+        apart=jnp.asarray(question.apart),
+    )  # fmt: skip
+
+
+def _inside(pair) -> tuple[float, float]:
+    if pair is None:
+        return -np.inf, np.inf
+    margin = _MARGIN * (pair[1] - pair[0])
+    return pair[0] + margin, pair[1] - margin
+
+
+def _checked(explanations, limits) -> dict[str, Fit]:
+    fits = by_name("explanations", explanations, "{'nothing': fit, 'coulomb_friction': other_fit}")
+    several("explanations", tuple(fits.values()), Fit, "fits as identify returns them")
+    if len(fits) < 2:
+        raise ValueError(f"expected two explanations or more to tell apart, got {', '.join(fits) or 'none'}")
+    instance("limits", limits, Limits, "make them by ehsvjax.Limits(command=(-5e-3, 5e-3))")
+    first = next(iter(fits.values()))
+    for name, fit in fits.items():
+        if len(fit.records) != len(first.records) or any(
+            len(a) != len(b) for a, b in zip(fit.records, first.records, strict=True)
+        ):
+            raise ValueError(f"expected explanations that were fitted to the same records; those of {name} are others")
+    model = first.model
+    for name in limits.between:
+        if name not in (*model.inputs, *model.outputs):
+            raise ValueError(
+                f"expected limits of inputs and outputs of {model.name}, {', '.join((*model.inputs, *model.outputs))}; "
+                f"got {name!r}"
+            )
+    missing = [name for name in model.inputs if name not in limits.between]
+    if missing:
+        raise ValueError(
+            f"expected limits of every input, got none of {', '.join(missing)}: Limits({missing[0]}=(...))"
+        )
+    return fits
+
+
+def _apart(fits, pairs) -> list[Pair]:
+    if pairs is None:
+        return list(itertools.permutations(fits, 2))
+    found = [tuple(pair) for pair in pairs]
+    for pair in found:
+        if len(pair) != 2 or pair[0] == pair[1] or not set(pair) <= set(fits):
+            raise ValueError(f"expected pairs of two explanations, of {', '.join(fits)}; got {pair}")
+    if not found:
+        raise ValueError("expected a pair of explanations to tell apart, got none")
+    return found
+
+
+def _changeable(can_change, fits) -> dict[str, tuple[float, float]]:
+    found = {}
+    for name, pair in by_name("can_change", can_change, "{'supply_pressure': (70e5, 210e5)}").items():
+        for fit in fits.values():
+            if name not in fit.model.nominal:
+                raise ValueError(
+                    f"expected can_change of parameters of {fit.model.name}, {', '.join(fit.model.nominal)}; "
+                    f"got {name!r}"
+                )
+        found[name] = as_pair(name, pair)
+    return found
+
+
+def _output(model, name: str) -> str:
+    if name not in model.outputs:
+        raise ValueError(f"expected can_add of outputs of {model.name}, {', '.join(model.outputs)}; got {name!r}")
+    return name

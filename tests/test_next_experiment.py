@@ -1,0 +1,225 @@
+"""The next experiment: commands keep their limits, separations are those of an independent refit, the plan is kept."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+import ehsvjax
+from ehsvjax import Limits, next_experiment
+from ehsvjax.experiment import commands
+from ehsvjax.experiment.plan import Option, best_of, told_apart
+from ehsvjax.experiment.separation import explained, predicted, refitted_cost, refitted_separation, separations
+from tests.hidden_plants import held_levels
+from tests.small_models import STIFFNESS, carriage, carriage_plant
+
+KEY = jax.random.key(2)
+PERIOD, NOISE = 0.02, 1e-3
+SOFT, HARD = "as given", "stiffer"
+STIFFER = 1.02 * STIFFNESS
+LIMITS = Limits(push=(-4.0, 4.0), position=(-0.3, 0.3))
+
+
+def push(seed, size):
+    return held_levels(np.random.default_rng(seed), size, 20, 20)
+
+
+def stroke(values, name="bench", noise=NOISE):
+    position = carriage_plant(values, PERIOD)[:, 0]
+    measured = position + noise * np.random.default_rng(9).standard_normal(len(values))
+    return ehsvjax.Record(PERIOD * np.arange(len(values)), {"push": values}, {"position": measured}, name=name)
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Let wrong types through to the package's own checks, as they are for a user."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture(scope="module")
+def fits():
+    """Two carriages that differ by 2% of their stiffness, fitted to a small motion of the softer one."""
+    record = stroke(push(1, 0.5))
+    return {
+        name: ehsvjax.identify(
+            carriage(stiffness), record, key=KEY, population=20, generations=10, initial="nominal",
+            noise_variance={"position": NOISE**2},
+        )
+        for name, stiffness in ((SOFT, STIFFNESS), (HARD, STIFFER))
+    }  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plan(fits):
+    return next_experiment(fits, LIMITS, key=KEY, generations=4)
+
+
+def by_scipy(fits, new, true=STIFFNESS, other=STIFFER):
+    """The same separation by SciPy's linear systems and least squares, the damping refitted."""
+    damping = fits[SOFT if true == STIFFNESS else HARD].parameters["damping"]
+    pushes = [fits[SOFT].records[0].inputs["push"], *new]
+    shown = [carriage_plant(u, PERIOD, stiffness=true, damping=damping)[:, 0] for u in pushes]
+
+    def left(x):
+        refitted = [carriage_plant(u, PERIOD, stiffness=other, damping=x[0])[:, 0] for u in pushes]
+        return (np.concatenate(refitted) - np.concatenate(shown)) / NOISE
+
+    return 2.0 * least_squares(left, [damping]).cost
+
+
+@given(
+    genes=st.lists(st.floats(0.0, 1.0), min_size=commands.GENES, max_size=commands.GENES),
+    lower=st.floats(-1e3, 1e3),
+    width=st.floats(1e-3, 1e3),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_command_keeps_its_limits_and_has_words(genes, lower, width):
+    time, upper = 1e-2 * np.arange(200), lower + width
+    made = commands.realised(np.array(genes), time, lower, upper)
+    assert made.shape == time.shape and np.isfinite(made).all()
+    assert lower - 1e-9 * abs(lower) - 1e-9 * width <= made.min() and made.max() <= upper + 1e-9 * (abs(upper) + width)
+    words = commands.described(np.array(genes), time, lower, upper, lambda value: f"{value:.3g}")
+    assert any(word in words for word in (*commands.KINDS, "steps of"))
+
+
+@pytest.mark.parametrize("kind", commands.KINDS)
+def test_every_kind_of_command_moves(kind):
+    genes = np.full(commands.GENES, 0.4)
+    genes[0], genes[1] = (commands.KINDS.index(kind) + 0.5) / len(commands.KINDS), 1.0
+    genes[5:] = np.linspace(0.0, 1.0, commands.GENES - 5)
+    made = commands.realised(genes, 1e-2 * np.arange(2000), -2.0, 4.0)
+    assert made.min() < -1.0 and made.max() > 3.0
+
+
+def test_a_separation_is_that_of_an_independent_refit(fits):
+    bigger = push(5, 4.0)
+    new = dataclasses.replace(stroke(bigger), outputs={})
+    for (true, other), values in {(SOFT, HARD): (STIFFNESS, STIFFER), (HARD, SOFT): (STIFFER, STIFFNESS)}.items():
+        found = refitted_separation(fits[true], fits[other], new, ["position"], {"position": NOISE**2})
+        assert found == pytest.approx(by_scipy(fits, [bigger], *values), rel=1e-2)
+        today = refitted_separation(fits[true], fits[other], new, [], {"position": NOISE**2})
+        assert today == pytest.approx(by_scipy(fits, [], *values), rel=1e-2, abs=1e-3)
+
+
+def test_to_first_order_a_separation_is_what_a_new_record_adds(fits):
+    pushes = [push(5, 4.0), push(6, 1.0)]
+    templates = [stroke(values) for values in pushes]
+    with jax.enable_x64(True):
+        soft, hard = (
+            predicted(
+                jax.tree.map(jnp.asarray, explained(fits[name], templates, {"position": NOISE**2})),
+                jnp.asarray(np.stack(pushes)[..., None]),
+                {},
+            )
+            for name in (SOFT, HARD)
+        )
+        found = np.asarray(separations(soft, hard, jnp.array([NOISE**2])))
+    for one, values in zip(found, pushes, strict=True):
+        assert one == pytest.approx(by_scipy(fits, [values]) - by_scipy(fits, []), rel=0.1)
+
+
+def test_measured_records_come_apart_as_was_said(fits):
+    """The softer plant, run, speaks for the softer model by the separation, give or take the noise along it."""
+    bigger = push(5, 4.0)
+    said = by_scipy(fits, [bigger])
+    records = [fits[SOFT].records[0], stroke(bigger, "new")]
+    cost = {name: refitted_cost(fit, records, {"position": NOISE**2}) for name, fit in fits.items()}
+    assert said > 100.0
+    assert cost[HARD] - cost[SOFT] == pytest.approx(said, abs=8.0 * said**0.5)
+
+
+@pytest.mark.parametrize("separation", [4.0, 16.0, 36.0, 80.0])
+def test_the_probability_of_being_told_apart_is_that_of_draws(separation):
+    along = separation**0.5 + np.random.default_rng(3).standard_normal(100_000)
+    gains = along**2 - (along - separation**0.5) ** 2
+    assert told_apart(separation) == pytest.approx(np.mean(gains > 9.0), abs=0.005)
+    assert told_apart(0.0) == 0.0
+
+
+def test_a_plan_tells_more_than_the_same_again_and_keeps_the_limits(fits, plan):
+    assert plan.chosen.least > 2.0 * plan.same_again.least > 2.0 * max(plan.today.values())
+    for name in fits:
+        position = plan.predicted(name)["position"]
+        assert np.abs(position).max() < 0.3
+    assert plan.record.outputs == {} and np.array_equal(plan.command, plan.record.inputs["push"])
+    assert np.abs(plan.command).max() <= 4.0
+    said = str(plan)
+    assert said.startswith("Next: push: ") and f"{SOFT} against {HARD}" in said and "the same experiment again" in said
+    for pair, separation in plan.chosen.separations.items():
+        one, other = ({SOFT: STIFFNESS, HARD: STIFFER}[name] for name in pair)
+        assert separation == pytest.approx(by_scipy(fits, [plan.command], one, other), rel=0.02)
+
+
+def test_the_search_is_at_least_as_good_as_every_plain_experiment(plan):
+    searched = next(option for option in plan.options if not option.simple)
+    assert searched.least > 0.8 * max(option.least for option in plan.options)
+
+
+def test_a_plan_is_drawn(plan):
+    figure = plan.plot()
+    labels = [axes.get_ylabel().split("\n")[0] for axes in figure.axes]
+    assert labels == ["push", "position", "difference"]
+
+
+def test_the_same_key_gives_the_same_plan(fits, plan):
+    again = next_experiment(fits, LIMITS, key=KEY, generations=4)
+    assert again.chosen.words == plan.chosen.words and np.array_equal(again.command, plan.command)
+
+
+def test_a_plain_experiment_that_tells_enough_is_chosen():
+    record = stroke(push(1, 1.0))
+
+    def option(least, simple):
+        return Option("", record, ("position",), {("a", "b"): least}, simple)
+
+    searched, plain = option(500.0, False), option(70.0, True)
+    assert best_of([searched, plain]) is plain
+    assert best_of([option(50.0, False), option(30.0, True)]).simple is False
+    assert best_of([option(50.0, False), option(45.0, True)]).simple is True
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_limits_say_what_they_are_not():
+    with pytest.raises(ValueError, match=r"expected push between \(least, most\), the lower one first"):
+        Limits(push=(4.0, -4.0))
+    with pytest.raises(ValueError, match="give two numbers"):
+        Limits(push=4.0)
+    with pytest.raises(ValueError, match="duration"):
+        Limits(duration=0.0, push=(-1.0, 1.0))
+    assert repr(Limits(push=(-1.0, 1.0), duration=2.0)) == "Limits(push=(-1.0, 1.0), duration=2.0)"
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"explanations": {}}, "two explanations or more"),
+        ({"limits": Limits(position=(-1.0, 1.0))}, "limits of every input, got none of push"),
+        ({"limits": Limits(push=(-1.0, 1.0), pull=(0.0, 1.0))}, "got 'pull'"),
+        ({"limits": (-1.0, 1.0)}, "expected limits"),
+        ({"can_change": {"weight": (1.0, 2.0)}}, "expected can_change of parameters of carriage"),
+        ({"can_change": {"mass": 2.0}}, "give two numbers"),
+        ({"can_add": {"force": 1.0}}, "expected can_add of outputs of carriage"),
+        ({"can_add": {"velocity": -1.0}}, "noise_variance of velocity"),
+        ({"pairs": [(SOFT, "harder")]}, "pairs of two explanations"),
+        ({"pairs": []}, "a pair of explanations"),
+        ({"generations": 0}, "generations"),
+        ({"key": 3}, "key"),
+    ],
+)
+def test_what_cannot_be_meant_is_refused(fits, given, message):
+    arguments = {"explanations": fits, "limits": LIMITS, "key": KEY} | given
+    with pytest.raises(ValueError, match=message):
+        next_experiment(arguments.pop("explanations"), arguments.pop("limits"), **arguments)
+
+
+def test_explanations_of_other_records_are_refused(fits):
+    other = dataclasses.replace(fits[HARD], records=(stroke(push(1, 0.5)[:200]),))
+    with pytest.raises(ValueError, match="fitted to the same records; those of stiffer are others"):
+        next_experiment({SOFT: fits[SOFT], HARD: other}, LIMITS, key=KEY)
