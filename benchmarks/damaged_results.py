@@ -14,6 +14,7 @@ from benchmarks.damaged_arguments import (
     FLAG,
     FUNCTION,
     KEY,
+    MAPPING,
     NAME,
     NAN,
     NOT_ANYTHING,
@@ -37,7 +38,7 @@ from ehsvjax import effects
 
 def calls() -> Iterator[Call]:
     """Yield a right call of each, and one for each wrong value of each argument."""
-    for room in (of_records, of_fits):
+    for room in (of_records, of_fits, of_experiments):
         yield from room()
 
 
@@ -148,3 +149,30 @@ def of_fits() -> Iterator[Call]:
             yield Call(
                 "diagnose", argument, label, lambda a=argument, v=value, r=right: ehsvjax.diagnose(**{**r, a: v})
             )
+
+
+def of_experiments() -> Iterator[Call]:
+    """Yield calls that plan a next experiment."""
+    pair = {"one number": 1.0, "three numbers": (0.0, 1.0, 2.0), "text": "ab", "texts": ("a", "b"), "NaN": (0.0, NAN),
+            "upside down": (1.0, -1.0), "None": None}  # fmt: skip
+    yield from damaged("Limits", ehsvjax.Limits, {
+        "command": ((-1.0, 1.0), pair), "duration": (3.0, without(TIME, "None", "huge")),
+    })  # fmt: skip
+    fit = tank_fit()
+    fits = MAPPING | {"empty": {}, "one": {"as it is": fit}, "texts in it": {"a": "fit", "b": "fit"}}
+    pairs = {"text": "ab", "number": 3.0, "unknown": [("a", "c")], "itself": [("a", "a")], "empty": [],
+             "three": [("a", "b", "c")], "numbers": [1.0, 2.0]}  # fmt: skip
+    right = {
+        "explanations": {"a": fit, "b": fit}, "limits": ehsvjax.Limits(command=(-1.0, 1.0)), "key": jax.random.key(0),
+        "can_change": {"lag": (0.5, 1.0)}, "can_add": None, "pairs": None, "generations": 1,
+    }  # fmt: skip
+    for argument, wrong in (
+        ("explanations", fits), ("limits", THING | {"huge": ehsvjax.Limits(command=(-1.0, 1.0), duration=1e12)}),
+        ("key", KEY), ("can_change", bounds_of("lag")), ("can_add", values_of("level") | {"zero": {"level": 0.0}}),
+        ("pairs", pairs), ("generations", WHOLE),
+    ):  # fmt: skip
+        for label, value in wrong.items():
+            yield Call(
+                "next_experiment", argument, label,
+                lambda a=argument, v=value: ehsvjax.next_experiment(**{**right, a: v}),
+            )  # fmt: skip

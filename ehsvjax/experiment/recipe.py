@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from ehsvjax.checks import by_name, instance, several, whole
+from ehsvjax.checks import by_name, fits_memory, instance, several, whole
 from ehsvjax.draws import check_key
+from ehsvjax.excitation import sample_times
 from ehsvjax.experiment import commands
 from ehsvjax.experiment.limits import Limits, as_pair
 from ehsvjax.experiment.plan import Option, Pair, Plan, best_of
@@ -107,11 +108,14 @@ def next_experiment(
     variances = {**added, **first.noise_variance}
     watched = {name: pair for name, pair in limits.between.items() if name in model.outputs}
     outputs = tuple(name for name in model.outputs if name in variances or name in watched)
-    count = round((limits.duration or so_far.duration) / so_far.sample_period) + 1
-    time = so_far.sample_period * np.arange(count)
+    period = so_far.sample_period
+    time = sample_times((limits.duration or so_far.duration) + period, period)
+    unknowns = max(len(fit.parameters) + len(fit.initial[0]) for fit in fits.values())
+    sizes = f"{_POPULATION} experiments of {len(time)} samples, of which {unknowns} derivatives"
+    fits_memory("limits.duration", sizes, 4.0 * _POPULATION * len(time) * len(outputs) * unknowns * len(fits))
     template = Record(
         time,
-        {name: np.zeros(count) for name in model.inputs},
+        {name: np.zeros(len(time)) for name in model.inputs},
         {name: time for name in outputs},  # stands for readings that are not yet there
         hold=so_far.hold,
         constants={**so_far.constants, **{name: first.model.nominal[name] for name in changeable}},
@@ -304,13 +308,13 @@ def _checked(explanations, limits) -> dict[str, Fit]:
 def _apart(fits, pairs) -> list[Pair]:
     if pairs is None:
         return list(itertools.permutations(fits, 2))
-    found = [tuple(pair) for pair in pairs]
+    found = several("pairs", pairs, tuple, "give pairs of names, [('sensor_lag', 'input_lag')]")
     for pair in found:
         if len(pair) != 2 or pair[0] == pair[1] or not set(pair) <= set(fits):
             raise ValueError(f"expected pairs of two explanations, of {', '.join(fits)}; got {pair}")
     if not found:
         raise ValueError("expected a pair of explanations to tell apart, got none")
-    return found
+    return list(found)
 
 
 def _changeable(can_change, fits) -> dict[str, tuple[float, float]]:

@@ -274,6 +274,9 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
     lines = [
         f"to tell {' from '.join(a.causes)}: {a.settled_by}" for a in diagnosis.alternatives if a.settled_by
     ]  # fmt: skip
+    if diagnosis.explanations:
+        limits = ", ".join(f"{name}=(least, most)" for name in diagnosis.fit.model.inputs)
+        lines.append(f"the record that would tell: .next_experiment(ehsvjax.Limits({limits}), key=key)")
     if diagnosis.verdict == "unexplained":
         lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
     if diagnosis.verdict == "adequate":
