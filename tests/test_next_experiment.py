@@ -175,11 +175,13 @@ def test_the_same_key_gives_the_same_plan(fits, plan):
 def test_a_plain_experiment_that_tells_enough_is_chosen():
     record = stroke(push(1, 1.0))
 
-    def option(least, simple):
-        return Option("", record, ("position",), {("a", "b"): least}, simple)
+    def option(least, simple, changed=0):
+        return Option("", record, ("position",), {("a", "b"): least}, simple, changed)
 
     searched, plain = option(500.0, False), option(70.0, True)
     assert best_of([searched, plain]) is plain
+    changed = option(400.0, True, changed=1)
+    assert best_of([searched, changed, plain]) is plain and best_of([searched, changed]) is changed
     assert best_of([option(50.0, False), option(30.0, True)]).simple is False
     assert best_of([option(50.0, False), option(45.0, True)]).simple is True
 
@@ -205,6 +207,8 @@ def test_limits_say_what_they_are_not():
         ({"limits": (-1.0, 1.0)}, "expected limits"),
         ({"can_change": {"weight": (1.0, 2.0)}}, "expected can_change of parameters of carriage"),
         ({"can_change": {"mass": 2.0}}, "give two numbers"),
+        ({"can_change": {"damping": (1.0, 2.0)}}, "got damping, which is identified"),
+        ({"limits": Limits(push=(30.0, 40.0), position=(-0.3, 0.3)), "generations": 1}, "limits that some experiment"),
         ({"can_add": {"force": 1.0}}, "expected can_add of outputs of carriage"),
         ({"can_add": {"velocity": -1.0}}, "noise_variance of velocity"),
         ({"pairs": [(SOFT, "harder")]}, "pairs of two explanations"),

@@ -29,6 +29,7 @@ class Option(NamedTuple):
         separations: (true, other) -> noise variances by which the records so far and this one would speak for the
             true one of two explanations, all else refitted.
         simple: whether it is one of a few plain ones, and not what the search came to.
+        changed: how many constants are other than in the records so far.
 
     """
 
@@ -37,6 +38,7 @@ class Option(NamedTuple):
     outputs: tuple[str, ...]
     separations: dict[Pair, float]
     simple: bool
+    changed: int
 
     @property
     def least(self) -> float:
@@ -154,12 +156,12 @@ def _share(probability: float) -> str:
 
 
 def best_of(options: Sequence[Option]) -> Option:
-    """Return the option to choose: the first simple one that tells enough, or nearly all that any tells."""
+    """Return the option to choose: the plainest that tells enough, or nearly all that any tells."""
     best = max(options, key=lambda option: option.least)
     enough = min(_ENOUGH, _NEARLY * best.least)
     return max(
         (option for option in options if option is best or (option.simple and option.least >= enough)),
-        key=lambda option: (option.simple, option.least),
+        key=lambda option: (option.simple, -option.changed, option.least),
     )
 
 

@@ -1,6 +1,5 @@
 """The recipe of a plan: simulate many experiments under every explanation, search, refit the best few exactly."""
 
-import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,13 +13,12 @@ from jaxtyping import Array, Bool, Float, Key
 from ehsvjax.checks import by_name, fits_memory, instance, several, whole
 from ehsvjax.draws import check_key
 from ehsvjax.excitation import sample_times
-from ehsvjax.experiment import commands
 from ehsvjax.experiment.limits import Limits, as_pair
 from ehsvjax.experiment.plan import Option, Pair, Plan, best_of
 from ehsvjax.experiment.separation import Explained, explained, predicted, refitted_separation, separations
+from ehsvjax.experiment.space import Space, as_record, kind_of, plain, realised
 from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators
-from ehsvjax.plots import quantity
 from ehsvjax.population import cast
 from ehsvjax.record import Record
 from ehsvjax.search import search
@@ -33,17 +31,6 @@ _MARGIN = 0.05
 _BROKEN = 1e3
 # Simple experiments whose separation is worked out exactly.
 _SIMPLE = 3
-# Genes of the simple ones: every kind at these amplitudes and time scales, in the middle, from fixed levels.
-_AMPLITUDES, _HOLDS = (1.0, 0.5), (0.45, 0.8)
-_PLAIN = np.array([0.03, 0.91, 0.37, 0.66, 0.15, 0.82, 0.47, 0.99, 0.28, 0.72, 0.09, 0.58])
-
-
-class Space(NamedTuple):
-    """What experiments there are: `[input, 2]` limits of the inputs, of each constant that can be changed its two."""
-
-    time: Float[Any, " time"]
-    inputs: Float[Any, "input 2"]
-    constants: dict[str, Float[Any, "2"]]
 
 
 class Question(NamedTuple):
@@ -144,34 +131,41 @@ def next_experiment(
 
 def _planned(question: Question, fits, apart, template: Record, measured, variances, key, generations: int) -> Plan:
     """Return the plan with some outputs measured."""
-    single = _cast(question, jnp.float32)
-    unknowns = commands.GENES * len(question.space.inputs) + len(question.space.constants)
+    single, space = _cast(question, jnp.float32), question.space
     state, _ = search(
         jax.tree_util.Partial(_cost, single),
         key,
-        unknowns=unknowns,
+        unknowns=space.genes,
         population=_POPULATION,
         generations=generations,
         operators=Operators(),
         tolerance=0.0,
     )
-    plain = _plain(question.space)
-    costs = np.concatenate([np.asarray(_judged(single, jnp.asarray(part))) for part in _in_parts(plain)])[: len(plain)]
-    genes = [(np.asarray(state.elites[0], float), False), *((plain[i], True) for i in _best_kinds(plain, costs))]
+    first = next(iter(fits.values()))
+    usual = {name: template.constants[name] for name in space.constants}
+    searched, simple = np.asarray(state.elites[:1], float), plain(space, usual)
+    chosen = [(searched[0], False)] if state.elite_cost[0] < _BROKEN else []
+    chosen += [(simple[i], True) for i in _worth_a_refit(simple, _costs(single, simple), len(space.constants))]
+    if not chosen:
+        raise ValueError(
+            f"expected limits that some experiment keeps, got {', '.join(fits)} beyond them in all that were tried: "
+            "give the inputs narrower ones, or the outputs wider ones"
+        )
 
     def separated(record: Record, names) -> dict[Pair, float]:
         return {(a, b): refitted_separation(fits[a], fits[b], record, names, variances) for a, b in apart}
 
     options = []
-    for one, simple in genes:
-        record, words = _experiment(one, template, question.space, fits, measured)
-        options.append(Option(words, record, tuple(measured), separated(record, tuple(measured)), simple))
-    first = next(iter(fits.values()))
+    for genes, is_simple in chosen:
+        record, words = as_record(space, genes, first.model, template)
+        changed = sum(not np.isclose(record.constants[n], value) for n, value in usual.items())
+        words, names = f"{words}, measure {', '.join(measured)}", tuple(measured)
+        options.append(Option(words, record, names, separated(record, names), is_simple, changed))
     again, old = replace(first.records[0], outputs={}, name="again"), tuple(first.noise_variance)
     return Plan(
         chosen=best_of(options),
         options=tuple(sorted(options, key=lambda option: -option.least)),
-        same_again=Option("the same experiment again", again, old, separated(again, old), True),
+        same_again=Option("the same experiment again", again, old, separated(again, old), True, 0),
         today=separated(again, ()),
         explanations=dict(fits),
     )
@@ -179,7 +173,7 @@ def _planned(question: Question, fits, apart, template: Record, measured, varian
 
 def _cost(question: Question, individuals: Float[Array, "experiment gene"]) -> Float[Array, " experiment"]:
     """Return minus the least separation's logarithm of each experiment; above `_BROKEN` where it breaks the limits."""
-    inputs, constants = _realised(question.space, individuals)
+    inputs, constants = realised(question.space, individuals)
     every = [predicted(one, inputs, constants) for one in question.explanations]
     each = [
         jnp.where(question.apart[a, b], separations(every[a], every[b], question.noise_variance), jnp.inf)
@@ -196,62 +190,22 @@ def _cost(question: Question, individuals: Float[Array, "experiment gene"]) -> F
 _judged = jax.jit(_cost)
 
 
-def _realised(space: Space, individuals):
-    """Return the inputs `[experiment, time, input]` and the constants of each experiment."""
-    size, number = commands.GENES, len(space.inputs)
-
-    def command(genes, limits):
-        return commands.command(genes, space.time, limits[0], limits[1])
-
-    by_input = individuals[:, : size * number].reshape(-1, number, size)
-    inputs = jax.vmap(jax.vmap(command), (0, None))(by_input, space.inputs)
-    rest = individuals[:, size * number :]
-    constants = {n: pair[0] + rest[:, k] * (pair[1] - pair[0]) for k, (n, pair) in enumerate(space.constants.items())}
-    return jnp.moveaxis(inputs, 1, 2), constants
+def _costs(question: Question, genes: Float[np.ndarray, "experiment gene"]) -> Float[np.ndarray, " experiment"]:
+    """Return the costs of any number of experiments, in populations of one size, the last filled up."""
+    filled = np.concatenate([genes, np.repeat(genes[-1:], -len(genes) % _POPULATION, axis=0)]).astype(np.float32)
+    parts = np.split(filled, len(filled) // _POPULATION)
+    return np.concatenate([np.asarray(_judged(question, jnp.asarray(part))) for part in parts])[: len(genes)]
 
 
-def _plain(space: Space) -> Float[np.ndarray, "experiment gene"]:
-    """Return the genes of simple experiments: every kind, all inputs alike, every constant at an end of its range."""
-    found = []
-    ends = itertools.product((0.0, 1.0), repeat=len(space.constants))
-    for values in ends:
-        for kind, amplitude, hold in itertools.product(range(len(commands.KINDS)), _AMPLITUDES, _HOLDS):
-            own = np.concatenate([[(kind + 0.5) / len(commands.KINDS), amplitude, 0.5, hold, 0.5], _PLAIN])
-            found.append(np.concatenate([np.tile(own, len(space.inputs)), values]))
-    return np.array(found)
-
-
-def _in_parts(plain):
-    """Return experiments in populations of one size, the last filled up."""
-    filled = np.concatenate([plain, np.repeat(plain[-1:], -len(plain) % _POPULATION, axis=0)])
-    return np.split(filled.astype(np.float32), len(filled) // _POPULATION)
-
-
-def _best_kinds(plain, costs) -> list[int]:
-    """Return the best few that keep the limits, of different kinds."""
+def _worth_a_refit(genes, costs, constants: int) -> list[int]:
+    """Return the best few experiments that keep the limits, of different kinds, one with all constants as so far."""
+    order = [i for i in np.argsort(costs).tolist() if costs[i] < _BROKEN]
     best: dict[int, int] = {}
-    for i in np.argsort(costs).tolist():
-        kind = int(plain[i, 0] * len(commands.KINDS))
-        if costs[i] < _BROKEN:
-            best.setdefault(kind, i)
-    return list(best.values())[:_SIMPLE]
-
-
-def _experiment(genes, template: Record, space: Space, fits, measured) -> tuple[Record, str]:
-    """Return an experiment as a record without outputs, and in words."""
-    model = next(iter(fits.values())).model
-    inputs, words = {}, []
-    for k, (name, (lower, upper)) in enumerate(zip(model.inputs, space.inputs, strict=True)):
-        own = genes[k * commands.GENES : (k + 1) * commands.GENES]
-        inputs[name] = commands.realised(own, space.time, lower, upper)
-        in_unit = functools.partial(quantity, unit=model.unit(name))
-        words.append(f"{name}: {commands.described(own, space.time, lower, upper, in_unit)}")
-    rest, constants = genes[len(space.inputs) * commands.GENES :], dict(template.constants)
-    for (name, (lower, upper)), share in zip(space.constants.items(), rest, strict=True):
-        constants[name] = float(lower + share * (upper - lower))
-        words.append(f"{name} {quantity(constants[name], model.parameter(name).unit)}")
-    words.append(f"{space.time[-1]:.4g} s, measure {', '.join(measured)}")
-    return Record(space.time, inputs, hold=template.hold, constants=constants, name="next"), "; ".join(words)
+    for i in order:
+        best.setdefault(kind_of(genes[i]), i)
+    # The first of them are those with the constants as they were.
+    usual = [i for i in order if i < len(genes) // (1 + 2 * constants)]
+    return list(dict.fromkeys([*list(best.values())[:_SIMPLE], *usual[:1]]))
 
 
 def _cast(question: Question, dtype) -> Question:
@@ -321,6 +275,8 @@ def _changeable(can_change, fits) -> dict[str, tuple[float, float]]:
     found = {}
     for name, pair in by_name("can_change", can_change, "{'supply_pressure': (70e5, 210e5)}").items():
         for fit in fits.values():
+            if name in fit.model.free:
+                raise ValueError(f"expected can_change of constants, got {name}, which is identified: fix it")
             if name not in fit.model.nominal:
                 raise ValueError(
                     f"expected can_change of parameters of {fit.model.name}, {', '.join(fit.model.nominal)}; "
