@@ -455,7 +455,7 @@ def quantity(value: float, unit: str) -> str:
     """Return a value with its unit, in the prefix that reads best."""
     if not math.isfinite(value):
         return NOT_FINITE
-    prefix = _prefix(value, unit)
+    prefix = _prefix(abs(value), unit)
     return f"{value / _PREFIXES[prefix]:.3g} {prefix}{unit}".rstrip()
 
 
