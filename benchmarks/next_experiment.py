@@ -124,14 +124,20 @@ def _answer(found: Diagnosis, name: str) -> str:
 
 
 def _separations(plan: Plan, name: str, found: Diagnosis, first, second) -> dict[str, float]:
-    """Return what the plan said of the true explanation against the others, and what came of it: the least of each."""
+    """Return what the plan said of the truth against what it is told from worst, and what came of it.
+
+    What no experiment tells from it, such as an offset of the command from one of the spool, is left out.
+    """
     true = next((n for n in plan.explanations if n.split("@")[0] == name), None)
     if true is None:
         return {}
     variances = dict(next(iter(plan.explanations.values())).noise_variance)
     variances |= {"load_pressure": PRESSURE_NOISE} if "load_pressure" in second.outputs else {}
     costs = {n: refitted_cost(fit, [first, second], variances) for n, fit in plan.explanations.items()}
-    others = [other for one, other in plan.chosen.separations if one == true]
+    most = {pair: max(o.separations[pair] for o in plan.options) for pair in plan.chosen.separations}
+    others = [other for (one, other), separation in most.items() if one == true and separation > 1.0]
+    if not others:
+        return {"equal": len(most)}
     hardest = min(others, key=lambda other: plan.chosen.separations[true, other])
     return {
         "said": plan.chosen.separations[true, hardest],

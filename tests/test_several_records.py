@@ -162,7 +162,7 @@ def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_sett
         ehsvjax.Limits(command=(-6e-3, 6e-3), position=(-0.2, 0.2)), key=KEY,
         can_change={"supply_pressure": (70e5, 140e5)}, generations=3,
     )  # fmt: skip
-    assert max(plan.today.values()) < 9.0 and plan.chosen.least > 100.0, str(plan)
+    assert max(plan.today.values()) < 9.0 and min(plan.chosen.separations.values()) > 100.0, str(plan)
     both = [full, run(plan.record, 6, **load)]
     together = diagnose(fitted(ehsvjax.servovalve(), both), both, key=KEY)
     assert alone.verdict == "ambiguous" and "constant_load" in alone.alternatives[0].causes, str(alone)

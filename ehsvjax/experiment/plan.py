@@ -41,19 +41,15 @@ class Option(NamedTuple):
     changed: int
 
     @property
-    def least(self) -> float:
-        """The least of its separations: of the two explanations that it tells apart worst."""
-        return min(self.separations.values())
-
-    @property
-    def hardest(self) -> Pair:
-        """The (true, other) explanations that it tells apart worst."""
-        return min(self.separations, key=lambda pair: self.separations[pair])
-
-    @property
     def probability(self) -> float:
-        """Probability that the least separated pair will be told apart, noise considered."""
-        return told_apart(self.least)
+        """Probability that a pair of explanations will be told apart, noise considered: the mean of all pairs."""
+        pairs = by_pair(self.separations).values()
+        return sum(map(told_apart, pairs)) / len(pairs)
+
+    @property
+    def total(self) -> float:
+        """All of its separations together."""
+        return sum(self.separations.values())
 
 
 def told_apart(separation: float) -> float:
@@ -124,22 +120,30 @@ class Plan:
 def _sentences(plan: Plan) -> list[str]:
     chosen = plan.chosen
     lines = [f"Next: {chosen.words}.", ""]
-    for (true, other), separation in _by_pair(chosen.separations).items():
+    for (true, other), separation in by_pair(chosen.separations).items():
         before = min(plan.today.get((true, other), 0.0), plan.today.get((other, true), 0.0))
         lines.append(
             f"  {true} against {other}: {separation:.3g} noise variances ({before:.2g} today): "
             f"told apart in {_share(told_apart(separation))}"
         )
-    if told_apart(chosen.least) < 0.5:
-        lines.append("  nothing within these limits tells them apart: give wider ones, a longer record, another sensor")
-    lines += ["", "  what else was tried, by the pair that it tells apart worst:"]
-    others = [option for option in (*plan.options, plan.same_again) if option is not chosen]
-    lines += [f"  {option.least:8.3g}  {option.words}" for option in sorted(others, key=lambda o: -o.least)]
+    if min(told_apart(separation) for separation in by_pair(chosen.separations).values()) < 0.5:
+        lines.append(
+            "  what stays together needs wider limits, a longer record, or another sensor, if anything tells it"
+        )
+    lines += ["", "  what else was tried, by the share of pairs that it tells apart, with its mean separation:"]
+    for option in ranked([one for one in (*plan.options, plan.same_again) if one is not chosen]):
+        mean = option.total / len(option.separations)
+        lines.append(f"  {100 * option.probability:4.0f}%  {mean:9.3g}  {option.words}")
     return lines
 
 
-def _by_pair(separations: Mapping[Pair, float]) -> dict[Pair, float]:
-    """Return the lesser of a pair's two separations."""
+def ranked(options: Sequence[Option]) -> tuple[Option, ...]:
+    """Return options, the one that tells most first."""
+    return tuple(sorted(options, key=lambda option: (-option.probability, -option.total)))
+
+
+def by_pair(separations: Mapping[Pair, float]) -> dict[Pair, float]:
+    """Return for each pair, whichever is true, the lesser of its separations."""
     found: dict[Pair, float] = {}
     for (true, other), separation in separations.items():
         if (other, true) in found:
@@ -156,16 +160,13 @@ def _share(probability: float) -> str:
 
 
 def best_of(options: Sequence[Option]) -> Option:
-    """Return the option to choose: the plainest that tells enough, or nearly all that any tells."""
-    best = max(options, key=lambda option: option.least)
-    enough = min(_ENOUGH, _NEARLY * best.least)
+    """Return the option to choose: the plainest that tells as much as any, to a hundredth of the pairs."""
+    enough = max(option.probability for option in options) - _AS_MUCH
     return max(
-        (option for option in options if option is best or (option.simple and option.least >= enough)),
-        key=lambda option: (option.simple, -option.changed, option.least),
+        (option for option in options if option.probability >= enough),
+        key=lambda option: (option.simple, -option.changed, option.total),
     )
 
 
-# Noise variances that are as good as any: two explanations are then told apart in 99.9% of all records.
-_ENOUGH = 60.0
-# Share of the best separation for which a plain experiment is preferred.
-_NEARLY = 0.8
+# Share of the pairs of explanations by which one experiment may tell less than another and be preferred.
+_AS_MUCH = 0.01

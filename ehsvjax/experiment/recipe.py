@@ -14,7 +14,7 @@ from ehsvjax.checks import by_name, fits_memory, instance, several, whole
 from ehsvjax.draws import check_key
 from ehsvjax.excitation import sample_times
 from ehsvjax.experiment.limits import Limits, as_pair
-from ehsvjax.experiment.plan import Option, Pair, Plan, best_of
+from ehsvjax.experiment.plan import Option, Pair, Plan, best_of, ranked
 from ehsvjax.experiment.separation import Explained, explained, predicted, refitted_separation, separations
 from ehsvjax.experiment.space import Space, as_record, kind_of, plain, realised
 from ehsvjax.fit import Fit
@@ -27,8 +27,10 @@ from ehsvjax.unknowns import checked_variance
 _POPULATION = 32
 # Of the limits' range that the simulation of every explanation stays away from them.
 _MARGIN = 0.05
+# Separation of a pair, noise variances, that is worth half of the most that it can be worth.
+_SURE = 25.0
 # What breaks the limits costs this, and more by how far it does.
-_BROKEN = 1e3
+_BROKEN = 1.0
 # Simple experiments whose separation is worked out exactly.
 _SIMPLE = 3
 
@@ -65,8 +67,8 @@ def next_experiment(
     """Return the experiment that tells explanations apart best, within limits that each of them keeps.
 
     The genetic algorithm of this package searches experiments: kind, size, offset, pace and levels of every input, and
-    the values of constants that can be changed. To first order each is judged by the pair of explanations that it
-    separates worst; the best and a few plain ones are then refitted exactly. A plain one that tells enough is chosen.
+    the values of constants that can be changed. To first order each is judged by how many pairs of explanations it
+    separates; the best and a few plain ones are then refitted exactly. A plain one that tells as much is chosen.
 
     Args:
         explanations: name -> fit, all to the same records; `Diagnosis.next_experiment` gives those of a diagnosis.
@@ -164,7 +166,7 @@ def _planned(question: Question, fits, apart, template: Record, measured, varian
     again, old = replace(first.records[0], outputs={}, name="again"), tuple(first.noise_variance)
     return Plan(
         chosen=best_of(options),
-        options=tuple(sorted(options, key=lambda option: -option.least)),
+        options=ranked(options),
         same_again=Option("the same experiment again", again, old, separated(again, old), True, 0),
         today=separated(again, ()),
         explanations=dict(fits),
@@ -172,19 +174,21 @@ def _planned(question: Question, fits, apart, template: Record, measured, varian
 
 
 def _cost(question: Question, individuals: Float[Array, "experiment gene"]) -> Float[Array, " experiment"]:
-    """Return minus the least separation's logarithm of each experiment; above `_BROKEN` where it breaks the limits."""
+    """Return minus the share of what could be told apart of each experiment; `_BROKEN` and more beyond the limits.
+
+    A pair counts by its separation over that and the one at which it is all but sure: two explanations that no
+    experiment tells apart do not stand in the way of the others.
+    """
     inputs, constants = realised(question.space, individuals)
     every = [predicted(one, inputs, constants) for one in question.explanations]
-    each = [
-        jnp.where(question.apart[a, b], separations(every[a], every[b], question.noise_variance), jnp.inf)
-        for a, b in itertools.permutations(range(len(every)), 2)
-    ]
-    least = jnp.min(jnp.stack(each), axis=0)
+    pairs = itertools.permutations(range(len(every)), 2)
+    each = {(a, b): jnp.maximum(separations(every[a], every[b], question.noise_variance), 0.0) for a, b in pairs}
+    told = sum(jnp.where(question.apart[pair], d / (d + _SURE), 0.0) for pair, d in each.items())
     lower, upper = question.watched.T[:, None, None]
     beyond = [jnp.max(jnp.maximum(lower - one.outputs, one.outputs - upper), axis=(1, 2)) for one in every]
     worst = jnp.max(jnp.stack(beyond), axis=0)
-    cost = jnp.where(worst > 0.0, _BROKEN + worst, -jnp.log(jnp.maximum(least, 1e-6)))
-    return jnp.where(jnp.isfinite(least), cost, jnp.inf)
+    cost = jnp.where(worst > 0.0, _BROKEN + worst, -told / jnp.sum(question.apart))
+    return jnp.where(jnp.isfinite(told), cost, jnp.inf)
 
 
 _judged = jax.jit(_cost)
