@@ -20,10 +20,9 @@ from ehsvjax.precision.residual_noise import (
 
 # Directions of the candidates' responses below this share of the largest are counted as noise.
 _NEGLIGIBLE = 1e-3
-# Rounds of an estimate of coloured noise at most, and the share by which the last one changes it.
-_ROUNDS, _SETTLED = 100, 1e-3
-# Times the mean square of the whole residual that the variance of noise is at most, chance included.
-_AT_MOST = 2.0
+# Rounds of an estimate of coloured noise at most, the share by which the last one changes it, and the share of the
+# change before that each may have.
+_ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
 # Of a record, between which an explanation's gain may differ.
 _PARTS = 20
 
@@ -221,14 +220,16 @@ def noise_outside(
         for k, i in channels
     }
     # What was taken of the noise depends on the noise, first taken to be white. Of slow noise most lies inside the
-    # space: each round finds a part of what the last one missed. Misfit that the space does not hold looks like slow
-    # noise too, until that would be more than there is: what lies outside the space is then followed no further in.
-    first, refuted = None, set()
-    for _ in range(_ROUNDS):
+    # space: each round finds a part of what the last one missed. What does not settle, round by round, is misfit
+    # outside the space that looks like ever slower noise.
+    last = dict.fromkeys(channels, np.inf)
+    for count in range(_ROUNDS):
         before, found = noises, _completed(_of(noises, measured), basis, left, taken)
-        first = first or found
-        refuted |= {c for c in channels if not found[c].variance <= _AT_MOST}
-        noises = {c: first[c] if c in refuted else found[c] for c in channels}
+        changes = {c: abs(found[c].variance - noises[c].variance) for c in channels}
+        followed = {c: changes[c] <= _SETTLING * last[c] for c in channels}
+        noises = {c: found[c] if followed[c] else noises[c] for c in channels}
+        if count:  # the first was that from white noise to coloured
+            last = {c: changes[c] if followed[c] else 0.0 for c in channels}
         if all(_alike(noises[c], before[c]) for c in channels):
             break
     return _of({c: _times(noise, float(deviation[c]) ** 2) for c, noise in noises.items()}, measured)
