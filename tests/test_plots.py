@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from ehsvjax.plots import _quantity, plot_fit, plot_identification, plot_pressure_flow, to_png
+from ehsvjax.plots import plot_fit, plot_identification, plot_pressure_flow, quantity, to_png
 from tests import hand_made
 
 TRUE_FORCE = np.array([2.4, 4.4, 6.4, 8.4])
@@ -134,7 +134,7 @@ def test_notebooks_find_a_picture_in_the_figure():
     ],
 )
 def test_quantities_take_the_prefix_that_reads_best(value, unit, shown):
-    assert _quantity(value, unit) == shown
+    assert quantity(value, unit) == shown
 
 
 _HOSTILE = r"a_b $x^{ <b>&\frac{1}{ \n$$$"
