@@ -89,7 +89,7 @@ def _loop(trial: Trial) -> dict[str, Any]:
     second, clean = _run(hidden, sizes, plan.record, plan.chosen.outputs, rng)
     lower, upper = LIMITS.between["position"]
     row |= {"words": plan.chosen.words, "kept": bool(np.all((clean >= lower) & (clean <= upper)))}
-    row |= _separations(plan, trial.name, found, first, second)
+    row |= _separations(plan, trial.name, first, second)
     # A pressure that was not measured before was not fitted: the nominal model is fitted to both.
     both = ehsvjax.identify(ehsvjax.servovalve(), [first, second], key=key, population=50, generations=20)
     joint = ehsvjax.diagnose(both, [first, second], key=key, progress=False)
@@ -123,7 +123,7 @@ def _answer(found: Diagnosis, name: str) -> str:
     return {"adequate": "not seen", "unexplained": "unexplained"}.get(found.verdict, "wrong")
 
 
-def _separations(plan: Plan, name: str, found: Diagnosis, first, second) -> dict[str, float]:
+def _separations(plan: Plan, name: str, first, second) -> dict[str, float]:
     """Return what the plan said of the truth against what it is told from worst, and what came of it.
 
     What no experiment tells from it, such as an offset of the command from one of the spool, is left out.

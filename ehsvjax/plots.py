@@ -172,8 +172,7 @@ def plot_record(record: Record) -> "matplotlib.figure.Figure":
         rows = figure.subplots(len(signals), 1, squeeze=False)[:, 0]
         for axes, (name, values) in zip(rows, signals.items(), strict=True):
             if name in record.inputs:
-                held = "steps-post" if record.hold_of(name) == "zero" else "default"
-                axes.plot(record.time, values, color=_COMMAND, drawstyle=held, lw=1.0)
+                _draw_input(axes, record, name)
             else:
                 axes.plot(record.time, values, color=_MEASURED, ls="none", marker=".", ms=2.5, rasterized=True)
             missing = record.time[~np.isfinite(values)]
@@ -205,8 +204,7 @@ def plot_experiment(
         rows = figure.subplots(len(record.inputs) + 2 * len(outputs), 1, squeeze=False)[:, 0]
         for axes, (name, values) in zip(rows, record.inputs.items(), strict=False):
             factor, label = _scaled(values, model.unit(name))
-            held = "steps-post" if record.hold_of(name) == "zero" else "default"
-            axes.plot(record.time, values / factor, color=_COMMAND, drawstyle=held, lw=1.0)
+            _draw_input(axes, record, name, factor)
             axes.set_ylabel(f"{_words(name)}\n{label}")
         for i, output in enumerate(outputs):
             together, apart = rows[len(record.inputs) + 2 * i :][:2]
@@ -371,6 +369,12 @@ def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
         error_axes.plot(record.time, (true[name] - simulated) / factor, color=_MODEL, label="noise-free − model")
         _legend(error_axes)
     _share_time(axes, record)
+
+
+def _draw_input(axes, record: Record, name: str, factor: float = 1.0) -> None:
+    """Draw an input as it runs between samples."""
+    held = "steps-post" if record.hold_of(name) == "zero" else "default"
+    axes.plot(record.time, record.inputs[name] / factor, color=_COMMAND, drawstyle=held, lw=1.0)
 
 
 def _draw_series(axes, time, series: Mapping[str, Any], name: str, unit: str) -> None:

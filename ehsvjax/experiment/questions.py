@@ -28,11 +28,11 @@ def undecided_of(diagnosis: Diagnosis) -> tuple[dict[str, Fit], list[Pair]]:
     """
     explanations: dict[str, Fit] = {}
     pairs: list[Pair] = []
-    for cause in dict.fromkeys(one.instead_of for one in diagnosis.explanations):
+    causes = dict.fromkeys(one.instead_of for one in diagnosis.explanations)
+    for cause in causes:
         group = [one for one in diagnosis.explanations if one.instead_of == cause]
         likely = sorted(group, key=lambda one: -one.probability)[:_MOST]
-        several = len({one.instead_of for one in diagnosis.explanations}) > 1
-        names = [one.cause if one.cause == cause or not several else f"{one.cause} for {cause}" for one in likely]
+        names = [one.cause if one.cause == cause or len(causes) == 1 else f"{one.cause} for {cause}" for one in likely]
         explanations |= {name: one.fit for name, one in zip(names, likely, strict=True)}
         pairs += itertools.permutations(names, 2)
     if not pairs:
