@@ -187,43 +187,49 @@ def plot_record(record: Record) -> "matplotlib.figure.Figure":
 
 
 def plot_experiment(
-    record: Record, model: Model, said: Mapping[str, Mapping[str, Any]], outputs: Sequence[str]
+    records: Sequence[Record], model: Model, said: Mapping[str, Sequence[Record]], outputs: Sequence[str]
 ) -> "matplotlib.figure.Figure":
     """Draw an experiment that is planned: its inputs, what several models say of each output, and their differences.
 
     Args:
-        record: inputs.
+        records: inputs; one column for each.
         model: for the units.
-        said: name of each model -> output -> `[time]`; the first is what the others are compared with.
+        said: name of each model -> the records with its outputs; the first is what the others are compared with.
         outputs: those that are drawn.
 
     """
-    first, *others = said
+    count = len(records[0].inputs) + 2 * len(outputs)
     with _style():
-        figure = _figure(width=9.0, height=0.6 + 1.6 * (len(record.inputs) + 2 * len(outputs)))
-        rows = figure.subplots(len(record.inputs) + 2 * len(outputs), 1, squeeze=False)[:, 0]
-        for axes, (name, values) in zip(rows, record.inputs.items(), strict=False):
-            factor, label = _scaled(values, model.unit(name))
-            _draw_input(axes, record, name, factor)
-            axes.set_ylabel(f"{_words(name)}\n{label}")
-        for i, output in enumerate(outputs):
-            together, apart = rows[len(record.inputs) + 2 * i :][:2]
-            factor, label = _scaled(np.concatenate([one[output] for one in said.values()]), model.unit(output))
-            for k, (name, one) in enumerate(said.items()):
-                together.plot(record.time, one[output] / factor, color=f"C{k}", lw=1.0, label=_words(name))
-            together.set_ylabel(f"{_words(output)}\n{label}")
-            _legend(together)
-            differences = {name: said[name][output] - said[first][output] for name in others}
-            factor, label = _scaled(np.concatenate(list(differences.values())), model.unit(output))
-            for k, (name, values) in enumerate(differences.items(), 1):
-                apart.plot(
-                    record.time, values / factor, color=f"C{k}", lw=1.0, label=f"{_words(name)} − {_words(first)}"
-                )
-            apart.set_ylabel(f"difference\n{label}")
-            _legend(apart)
-        _share_time(rows, record)
+        figure = _figure(width=9.0, height=0.6 + 1.6 * count)
+        grid = figure.subplots(count, len(records), squeeze=False)
+        for k, record in enumerate(records):
+            _draw_experiment(grid[:, k], record, model, {name: each[k].outputs for name, each in said.items()}, outputs)
+            if len(records) > 1:
+                grid[0, k].set_title(record.name)
         figure.align_ylabels()
     return figure
+
+
+def _draw_experiment(rows, record: Record, model: Model, said: Mapping[str, Mapping[str, Any]], outputs) -> None:
+    first, *others = said
+    for axes, (name, values) in zip(rows, record.inputs.items(), strict=False):
+        factor, label = _scaled(values, model.unit(name))
+        _draw_input(axes, record, name, factor)
+        axes.set_ylabel(f"{_words(name)}\n{label}")
+    for i, output in enumerate(outputs):
+        together, apart = rows[len(record.inputs) + 2 * i :][:2]
+        factor, label = _scaled(np.concatenate([one[output] for one in said.values()]), model.unit(output))
+        for k, (name, one) in enumerate(said.items()):
+            together.plot(record.time, one[output] / factor, color=f"C{k}", lw=1.0, label=_words(name))
+        together.set_ylabel(f"{_words(output)}\n{label}")
+        _legend(together)
+        differences = {name: said[name][output] - said[first][output] for name in others}
+        factor, label = _scaled(np.concatenate(list(differences.values())), model.unit(output))
+        for k, (name, values) in enumerate(differences.items(), 1):
+            apart.plot(record.time, values / factor, color=f"C{k}", lw=1.0, label=f"{_words(name)} − {_words(first)}")
+        apart.set_ylabel(f"difference\n{label}")
+        _legend(apart)
+    _share_time(rows, record)
 
 
 def plot_identification(

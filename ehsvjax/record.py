@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.checks import as_number, flag, instance, refused, shown
+from ehsvjax.checks import as_number, file_path, flag, instance, refused, shown
 from ehsvjax.columns import Column, pick, unknown_name, vector
+from ehsvjax.files import written_whole
 from ehsvjax.holds import WORDS, interpolated
 from ehsvjax.matlab import mat_table
 from ehsvjax.readers import csv_table, excel_table, frame_table, npz_table, parquet_table
@@ -255,6 +256,14 @@ class Record:
         import pandas
 
         return pandas.DataFrame({"time": self.time, **self.inputs, **self.outputs})
+
+    def to_csv(self, path: str | PathLike[str]) -> None:
+        """Write `to_dataframe()` as a text file with a header, to the last digit; `from_csv` reads it.
+
+        Raises OSError if it cannot be written; a file that was there stays as it was.
+        """
+        with written_whole(Path(file_path("path", path))) as whole:
+            whole.write(self.to_dataframe().to_csv(index=False).encode())
 
     @classmethod
     def from_dataframe(

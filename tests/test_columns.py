@@ -108,7 +108,7 @@ def test_what_a_record_exports_reads_back(way, tmp_path):
     arrays = {name: frame[name].to_numpy() for name in frame.columns}
     with open(path, "wb") as file:
         if way == "csv":
-            frame.to_csv(file, index=False)
+            record.to_csv(path)
         elif way == "npz":
             np.savez(file, **arrays)
         elif way == "mat":

@@ -127,6 +127,19 @@ def test_design_is_the_bound_and_needs_no_outputs():
     bound = ehsvjax.cramer_rao_bound(ehsvjax.servovalve(), filled, noise_variance=VARIANCE)
     for name, error in found.standard_errors.items():
         assert error == pytest.approx(bound[name], rel=1e-6)
+    # Half of the readings, at random, tell half as much, whatever they read.
+    read = np.where(np.random.default_rng(1).random(len(experiment)) < 0.5, experiment.time, np.nan)
+    half = replace(experiment, outputs={"position": read})
+    for name, error in ehsvjax.design(ehsvjax.servovalve(), half, noise_variance=VARIANCE).standard_errors.items():
+        assert error == pytest.approx(2.0**0.5 * bound[name], rel=0.1)
+    # A sensor may be there in one record only.
+    one, two = (
+        ehsvjax.design(ehsvjax.servovalve(), records, noise_variance=known).standard_errors
+        for records, known in (([filled, filled], VARIANCE), ([filled, experiment], {**VARIANCE, "spool": 1e-10}))
+    )
+    for name, error in one.items():
+        assert error == pytest.approx(bound[name] / 2.0**0.5, rel=1e-4)
+        assert two[name] < error
     with pytest.raises(ValueError, match="got 'pressure'"):
         ehsvjax.design(ehsvjax.servovalve(), experiment, noise_variance={"pressure": 1.0})
 

@@ -1,5 +1,6 @@
 """Several records in one diagnosis: of unlike length, period, noise and conditions, from independent plants."""
 
+import html
 from dataclasses import replace
 
 import jax
@@ -153,7 +154,7 @@ def test_a_record_may_hold_outputs_that_another_does_not(held):
 
 
 @of_the_servovalve
-def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_settles():
+def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_settles(tmp_path):
     load = {"constant_load": {"force": 800.0}}
     full = valve_stroke(5, 140e5, "full", **load)
     alone = diagnose(fitted(ehsvjax.servovalve(), full), full, key=KEY)
@@ -163,6 +164,9 @@ def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_sett
         can_change={"supply_pressure": (70e5, 140e5)}, generations=3,
     )  # fmt: skip
     assert max(plan.today.values()) < 9.0 and min(plan.chosen.separations.values()) > 100.0, str(plan)
+    alone.report(tmp_path / "page.html", plan)
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert html.escape(str(plan)) in page and page.count("<img") == 3
     both = [full, run(plan.record, 6, **load)]
     together = diagnose(fitted(ehsvjax.servovalve(), both), both, key=KEY)
     assert alone.verdict == "ambiguous" and "constant_load" in alone.alternatives[0].causes, str(alone)

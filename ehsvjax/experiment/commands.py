@@ -1,48 +1,88 @@
 """A family of commands, each a point of the unit cube: what a search for the best experiment can choose from."""
 
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 KINDS = ("held levels", "two levels", "staircase", "triangles", "multisine", "steps with rest")
+OWN = "your own signal"
 _LEVELS = 12
 GENES = 5 + _LEVELS
 """Coordinates of a command: its kind, amplitude, offset, time scale, another number of its kind, and levels."""
 # Of the longest hold in the record's length, and of the shortest in samples.
 _LONGEST, _SHORTEST = 0.25, 4.0
+# Of the amplitude, in half of the limits' range.
+_LEAST = 0.02
 _LINES = 16
 _STEPS = 12
 # The levels of a longer sequence follow by this share of the range, which meets no level twice (Weyl 1916).
 _GOLDEN = 0.6180339887498949
 
 
-def command(
-    genes: Float[Array, " gene"], time: Float[Array, " time"], lower: Float[Array, ""], upper: Float[Array, ""]
-) -> Float[Array, " time"]:
-    """Return the command of one point of the unit cube; it keeps between lower and upper.
+class Reach(NamedTuple):
+    """What an input can do.
+
+    Attributes:
+        lower, upper: its limits.
+        rate: the most that it changes by in a second; +inf where that has no limit.
+        own: `[time]` a signal of the user's; None where there is none.
+
+    """
+
+    lower: Any
+    upper: Any
+    rate: Any
+    own: Any = None
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of commands there are."""
+        return KINDS if self.own is None else (*KINDS, OWN)
+
+
+def command(genes: Float[Array, " gene"], time: Float[Array, " time"], reach: Reach) -> Float[Array, " time"]:
+    """Return the command of one point of the unit cube; it keeps within what the input can do.
 
     Args:
         genes: in the unit cube.
         time: from zero, s.
-        lower, upper: in the command's unit.
+        reach: of the input, in its unit.
 
     """
-    amplitude, centre, hold = _size(genes, time, lower, upper)
-    forms = jnp.stack([form(genes, time, hold) for form in _FORMS])
-    return centre + amplitude * forms[kind_of(genes)]
+    amplitude, centre, hold = _size(genes, time, reach)
+    own = [] if reach.own is None else [_from_minus_one_to_one(reach.own)]
+    forms = jnp.stack([form(genes, time, hold) for form in _FORMS] + own)
+    wanted = centre + amplitude * forms[kind_of(genes, reach)]
+    return jnp.where(jnp.isinf(reach.rate), wanted, _no_faster(wanted, time, reach))
 
 
-def kind_of(genes):
-    """Return the place in `KINDS` of a point of the unit cube."""
-    return jnp.minimum((genes[0] * len(KINDS)).astype(jnp.int32), len(KINDS) - 1)
+def kind_of(genes, reach: Reach):
+    """Return the place in `reach.kinds` of a point of the unit cube."""
+    count = len(reach.kinds)
+    return jnp.minimum((genes[0] * count).astype(jnp.int32), count - 1)
 
 
-def _size(genes, time, lower, upper):
+def _no_faster(wanted, time, reach):
+    """Follow a signal at no more than the greatest rate, from rest: from zero, or what is nearest to it."""
+    most = jnp.minimum(reach.rate * (time[1] - time[0]), reach.upper - reach.lower)
+
+    def step(now, target):
+        now = now + jnp.clip(target - now, -most, most)
+        return now, now
+
+    rest = jnp.clip(jnp.zeros_like(wanted[0]), reach.lower, reach.upper)
+    return lax.scan(step, rest, wanted)[1]
+
+
+def _size(genes, time, reach):
     """Return amplitude, centre and hold time."""
-    half = 0.5 * (upper - lower)
-    amplitude = half * (0.02 + 0.98 * genes[1])
-    centre = lower + half + (2.0 * genes[2] - 1.0) * (half - amplitude)
+    half = 0.5 * (reach.upper - reach.lower)
+    amplitude = half * (_LEAST + (1.0 - _LEAST) * genes[1])
+    centre = reach.lower + half + (2.0 * genes[2] - 1.0) * (half - amplitude)
     shortest, longest = _SHORTEST * (time[1] - time[0]), _LONGEST * time[-1]
     return amplitude, centre, shortest * (longest / shortest) ** genes[3]
 
@@ -100,29 +140,47 @@ def _steps_with_rest(genes, time, hold):
     return size * jnp.array([1.0, 0.0, -1.0, 0.0])[(count % 4).astype(jnp.int32)]
 
 
+def _from_minus_one_to_one(own):
+    """Shift and scale a signal; one that stands still is in the middle."""
+    lowest, highest = jnp.min(own), jnp.max(own)
+    return (2.0 * own - lowest - highest) / jnp.where(highest > lowest, highest - lowest, 1.0)
+
+
 _FORMS = (_held_levels, _two_levels, _staircase, _triangles, _multisine, _steps_with_rest)
 
 
-def realised(genes: Float[np.ndarray, " gene"], time, lower: float, upper: float) -> Float[np.ndarray, " time"]:
+def realised(genes: Float[np.ndarray, " gene"], time, reach: Reach) -> Float[np.ndarray, " time"]:
     """Return the command in float64, as a rig is given it."""
     with jax.enable_x64(True):
-        return np.asarray(_command(*(jnp.float64(x) for x in (genes, time, lower, upper))))
+        return np.asarray(_command(*jax.tree.map(jnp.float64, (genes, time, reach))))
 
 
 _command = jax.jit(command)
 
 
-def described(genes: Float[np.ndarray, " gene"], time, lower: float, upper: float, quantity) -> str:
+def of_own_size(reach: Reach) -> tuple[float, float]:
+    """Return the genes of amplitude and offset by which a signal of the user's own is as it was, if that can be."""
+    values = np.asarray(reach.own)
+    half, middle = 0.5 * (reach.upper - reach.lower), 0.5 * (reach.upper + reach.lower)
+    amplitude = np.clip(0.5 * np.ptp(values) / half, _LEAST, 1.0)
+    room = half * (1.0 - amplitude)
+    offset = (0.5 * (values.max() + values.min()) - middle) / room if room > 0.0 else 0.0
+    return float((amplitude - _LEAST) / (1.0 - _LEAST)), float(np.clip(0.5 + 0.5 * offset, 0.0, 1.0))
+
+
+def described(genes: Float[np.ndarray, " gene"], time, reach: Reach, quantity) -> str:
     """Return a command in words a technician follows; `quantity` writes a value of the command with its unit."""
-    amplitude, centre, hold = (float(x) for x in _size(genes, time, lower, upper))
-    kind, steps = KINDS[int(kind_of(jnp.asarray(genes)))], int(2.0 + np.floor(genes[4] * (_STEPS - 1)))
+    amplitude, centre, hold = (float(x) for x in _size(genes, time, reach))
+    kind, steps = reach.kinds[int(kind_of(jnp.asarray(genes), reach))], int(2.0 + np.floor(genes[4] * (_STEPS - 1)))
     about = f" about {quantity(centre)}" if abs(centre) > 0.01 * amplitude else ""
     size = f"of up to {quantity(amplitude)}{about}"
-    return {
+    words = {
         "held levels": f"held levels {size}, a new one every {hold:.3g} s",
         "two levels": f"two levels {size}, a new draw every {hold:.3g} s",
         "staircase": f"a staircase {size}, up and down in {steps} steps from the middle, each held for {hold:.3g} s",
         "triangles": f"triangles {size} of {4.0 * hold:.3g} s each, growing from {100 * float(genes[4]):.0f}%",
         "multisine": f"a multisine {size}, up to {0.5 / hold:.3g} Hz",
         "steps with rest": f"steps {size} of both signs in {steps} sizes, each for {hold:.3g} s and as long a rest",
+        OWN: f"{OWN} {size}",
     }[kind]
+    return words if np.isinf(reach.rate) else f"{words}, no faster than {quantity(float(reach.rate))} a second"

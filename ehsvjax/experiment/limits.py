@@ -3,32 +3,47 @@
 from collections.abc import Mapping
 from typing import Any
 
-from ehsvjax.checks import number, positive
+from ehsvjax.checks import by_name, number, positive
 
 
 class Limits:
     """Limits of an experiment, SI: `Limits(command=(-5e-3, 5e-3), position=(-0.08, 0.08), duration=10.0)`.
 
+    `rates={"command": 0.1}` limits how fast an input runs as well.
+
     Attributes:
         between: name of an input or an output of the model -> (least, most). Every input must have them; outputs keep
             within theirs in the simulation of every explanation, measured or not.
-        duration: s, of the record; None: as long as the first one so far.
+        rates: name of an input -> the most that it changes by in a second; such an input starts from zero, or from
+            what is nearest to it within its limits.
+        duration: s, of the experiment; None: as long as the first record so far.
 
     """
 
-    def __init__(self, *, duration: float | None = None, **between: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        *,
+        duration: float | None = None,
+        rates: Mapping[str, float] | None = None,
+        **between: tuple[float, float],
+    ) -> None:
         """Check the limits.
 
         Raises:
-            ValueError: for what is no pair of numbers in order, or no time.
+            ValueError: for what is no pair of numbers in order, no rate, or no time.
 
         """
         self.duration = None if duration is None else positive("duration", duration, "give seconds above 0")
+        given = by_name("rates", rates, '{"command": 0.1}')
+        remedy = "give the most that it changes by in a second"
+        self.rates: Mapping[str, float] = {n: positive(f"rate of {n}", rate, remedy) for n, rate in given.items()}
         self.between: Mapping[str, tuple[float, float]] = {n: as_pair(n, pair) for n, pair in between.items()}
 
     def __repr__(self) -> str:
         """Return the call that makes them."""
-        given = {**self.between} | ({} if self.duration is None else {"duration": self.duration})
+        given: dict[str, Any] = {**self.between}
+        given |= {"rates": self.rates} if self.rates else {}
+        given |= {} if self.duration is None else {"duration": self.duration}
         return f"Limits({', '.join(f'{name}={value!r}' for name, value in given.items())})"
 
 

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def plot_plan(plan: "Plan") -> "matplotlib.figure.Figure":
-    """Draw the inputs, what each explanation says of each output, and where they part."""
+    """Draw the inputs, what each explanation says of each output, and where they part; records beside each other."""
     model = next(iter(plan.explanations.values())).model
     said = {name: plan.predicted(name) for name in plan.explanations}
-    return plots.plot_experiment(plan.record, model, said, plan.chosen.outputs)
+    return plots.plot_experiment(plan.records, model, said, plan.chosen.outputs)

@@ -10,7 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
+from ehsvjax.experiment.separation import as_said, known_initial
 from ehsvjax.fit import Fit
+from ehsvjax.precision.design import design
+from ehsvjax.precision.standard_errors import Precision
 from ehsvjax.record import Record
 
 if TYPE_CHECKING:
@@ -24,17 +27,17 @@ class Option(NamedTuple):
 
     Attributes:
         words: what to do.
-        record: its inputs and constants; no outputs.
-        outputs: names of those that are measured in it.
-        separations: (true, other) -> noise variances by which the records so far and this one would speak for the
-            true one of two explanations, all else refitted.
+        records: inputs and constants of each; no outputs.
+        outputs: names of those that are measured.
+        separations: (true, other) -> noise variances by which the records so far and these would speak for the true
+            one of two explanations, all else refitted.
         simple: whether it is one of a few plain ones, and not what the search came to.
-        changed: how many constants are other than in the records so far.
+        changed: how much is other than in the records so far: constants, sensors that are added, records beyond one.
 
     """
 
     words: str
-    record: Record
+    records: tuple[Record, ...]
     outputs: tuple[str, ...]
     separations: dict[Pair, float]
     simple: bool
@@ -73,6 +76,7 @@ class Plan:
         same_again: what the first record once more would tell.
         today: (true, other) -> separation by the records so far.
         explanations: name -> fit.
+        noise_variance: of each output that was measured or could be.
 
     """
 
@@ -81,28 +85,53 @@ class Plan:
     same_again: Option
     today: dict[Pair, float]
     explanations: dict[str, Fit]
+    noise_variance: dict[str, float]
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """The records to be made: time, inputs and constants, without outputs; `to_csv` writes one for the rig."""
+        return self.chosen.records
 
     @property
     def record(self) -> Record:
-        """The record to be made: time, inputs and constants, without outputs."""
-        return self.chosen.record
+        """The first of them."""
+        return self.records[0]
 
     @property
     def command(self) -> Float[np.ndarray, " time"]:
-        """The first input of the record, `[time]`, SI."""
-        return next(iter(self.chosen.record.inputs.values()))
+        """The first input of the first record, `[time]`, SI."""
+        return next(iter(self.record.inputs.values()))
 
-    def predicted(self, name: str) -> dict[str, Float[np.ndarray, " time"]]:
-        """Return what an explanation says that the chosen experiment will show, output -> `[time]`, SI.
+    def predicted(self, name: str) -> tuple[Record, ...]:
+        """Return the chosen records with every output as an explanation says that it will be.
 
         Raises:
             ValueError: for a name that is no explanation's.
 
         """
+        fit = self._explanation(name)
+        return tuple(as_said(fit, self.records, fit.model.outputs))
+
+    def precision(self, name: str) -> Precision:
+        """Return the standard errors that an explanation's parameters would have by all records together.
+
+        Raises:
+            ValueError: for a name that is no explanation's.
+
+        """
+        fit = self._explanation(name)
+        new = as_said(fit, self.records, self.chosen.outputs)
+        names = {n for record in (*fit.records, *new) for n in record.outputs}
+        return design(
+            fit.model, [*fit.records, *new], parameters=fit.parameters, initial_values=fit.initial[0],
+            noise_variance={n: v for n, v in self.noise_variance.items() if n in names},
+            initial=known_initial(fit, len(fit.records), len(new)),
+        )  # fmt: skip
+
+    def _explanation(self, name: str) -> Fit:
         if name not in self.explanations:
             raise ValueError(f"expected one of {', '.join(self.explanations)}; got {name!r}")
-        fit = self.explanations[name]
-        return fit.simulate(self.chosen.record, fit.initial[0])
+        return self.explanations[name]
 
     def __str__(self) -> str:
         """Return what to do and what it will tell, in a few sentences."""
@@ -122,19 +151,32 @@ def _sentences(plan: Plan) -> list[str]:
     lines = [f"Next: {chosen.words}.", ""]
     for (true, other), separation in by_pair(chosen.separations).items():
         before = min(plan.today.get((true, other), 0.0), plan.today.get((other, true), 0.0))
+        probability = told_apart(separation)
         lines.append(
             f"  {true} against {other}: {separation:.3g} noise variances ({before:.2g} today): "
-            f"told apart in {_share(told_apart(separation))}"
-        )
-    if min(told_apart(separation) for separation in by_pair(chosen.separations).values()) < 0.5:
-        lines.append(
-            "  what stays together needs wider limits, a longer record, or another sensor, if anything tells it"
+            + (f"told apart in {_share(probability)}" if probability >= 0.5 else _why_not(plan, true, other))
         )
     lines += ["", "  what else was tried, by the share of pairs that it tells apart, with its mean separation:"]
-    for option in ranked([one for one in (*plan.options, plan.same_again) if one is not chosen]):
+    others = [one for one in plan.options if one is not chosen][:_LISTED]
+    for option in ranked([*others, plan.same_again]):
         mean = option.total / len(option.separations)
         lines.append(f"  {100 * option.probability:4.0f}%  {mean:9.3g}  {option.words}")
     return lines
+
+
+def _why_not(plan: Plan, true: str, other: str) -> str:
+    """Return why two explanations stay together, whatever was tried: too small to be seen, or followed by the other."""
+    difference = sum(
+        np.sum((one.outputs[name] - two.outputs[name]) ** 2) / plan.noise_variance[name]
+        for one, two in zip(plan.predicted(true), plan.predicted(other), strict=True)
+        for name in plan.chosen.outputs
+    )
+    if difference < INSEPARABLE:
+        return "the noise hides it; wider limits or a longer record would show it, if anything does"
+    return (
+        f"hardly told apart, as the parameters of one can do what the other does ({difference:.3g} noise variances "
+        "before they do); another sensor would tell, or a constant that can be changed, if anything does"
+    )
 
 
 def ranked(options: Sequence[Option]) -> tuple[Option, ...]:
@@ -168,5 +210,7 @@ def best_of(options: Sequence[Option]) -> Option:
     )
 
 
+# Options that a print tells of besides.
+_LISTED = 5
 # Share of the pairs of explanations by which one experiment may tell less than another and be preferred.
 _AS_MUCH = 0.01

@@ -1,57 +1,24 @@
-"""The recipe of a plan: simulate many experiments under every explanation, search, refit the best few exactly."""
+"""The recipe of a plan: what is asked, the experiments that tell most, and the plainest of those that tell enough."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Key
 
-from ehsvjax.checks import by_name, fits_memory, instance, several, whole
+from ehsvjax.checks import by_name, instance, several, whole
 from ehsvjax.draws import check_key
-from ehsvjax.excitation import sample_times
 from ehsvjax.experiment.limits import Limits, as_pair
+from ehsvjax.experiment.options import Question, options_of, separated
 from ehsvjax.experiment.plan import Option, Pair, Plan, best_of, ranked
-from ehsvjax.experiment.separation import Explained, explained, predicted, refitted_separation, separations
-from ehsvjax.experiment.space import Space, as_record, kind_of, plain, realised
+from ehsvjax.experiment.separation import as_said_so_far
 from ehsvjax.fit import Fit
-from ehsvjax.genetic import Operators
-from ehsvjax.population import cast
 from ehsvjax.record import Record
-from ehsvjax.search import search
 from ehsvjax.unknowns import checked_variance
 
-_POPULATION = 32
-# Of the limits' range that the simulation of every explanation stays away from them.
-_MARGIN = 0.05
-# Separation of a pair, noise variances, that is worth half of the most that it can be worth.
-_SURE = 25.0
-# What breaks the limits costs this, and more by how far it does.
-_BROKEN = 1.0
-# Simple experiments whose separation is worked out exactly.
-_SIMPLE = 3
-
-
-class Question(NamedTuple):
-    """Everything that a separation is computed from: the experiments there are, and the explanations.
-
-    Attributes:
-        space: the experiments.
-        explanations: each made ready.
-        noise_variance: `[signal]` of the outputs; +inf for one that is watched and not measured.
-        watched: `[signal, 2]` limits of the outputs, with their margin.
-        apart: `[true, other]` which explanations are to be told apart.
-
-    """
-
-    space: Space
-    explanations: tuple[Explained, ...]
-    noise_variance: Float[Any, " signal"]
-    watched: Float[Any, "signal 2"]
-    apart: Bool[Any, "true other"]
+# Probability of telling a pair apart at which nothing more is asked for.
+_CERTAIN = 0.99
 
 
 def next_experiment(
@@ -61,6 +28,8 @@ def next_experiment(
     key: Key[Array, ""],
     can_change: Mapping[str, tuple[float, float]] | None = None,
     can_add: Mapping[str, float] | None = None,
+    records: int = 1,
+    own: Record | None = None,
     pairs: Sequence[Pair] | None = None,
     generations: int = 20,
 ) -> Plan:
@@ -77,6 +46,9 @@ def next_experiment(
         can_change: name of a constant of the model -> (least, most) that the rig can be set to, SI.
         can_add: name of an output that could be measured too -> variance of its noise, its unit squared. It is asked
             for only where the experiment tells too little without it.
+        records: how many records may share the time, each from rest and with constants of its own: asked for only where
+            one record tells too little.
+        own: a record whose inputs are tried as well, as they are and scaled; a shorter one repeats itself.
         pairs: (true, other) names of explanations that are to be told apart; by default each from every other. Where
             one contains the other, only the one that says more can be told from it.
         generations: of the search.
@@ -90,150 +62,44 @@ def next_experiment(
     check_key(key)
     apart = _apart(fits, pairs)
     first = next(iter(fits.values()))
-    model, so_far = first.model, first.records[0]
     whole("generations", generations, 1, 1000)
+    most_records = whole("records", records, 1, 10)
     changeable = _changeable(can_change, fits)
-    added = {n: checked_variance(model, _output(model, n), v) for n, v in by_name("can_add", can_add, "").items()}
+    added = {
+        n: checked_variance(first.model, _output(first.model, n), v) for n, v in by_name("can_add", can_add, "").items()
+    }
     variances = {**added, **first.noise_variance}
-    watched = {name: pair for name, pair in limits.between.items() if name in model.outputs}
-    outputs = tuple(name for name in model.outputs if name in variances or name in watched)
-    period = so_far.sample_period
-    time = sample_times((limits.duration or so_far.duration) + period, period)
-    unknowns = max(len(fit.parameters) + len(fit.initial[0]) for fit in fits.values())
-    sizes = f"{_POPULATION} experiments of {len(time)} samples, of which {unknowns} derivatives"
-    fits_memory("limits.duration", sizes, 4.0 * _POPULATION * len(time) * len(outputs) * unknowns * len(fits))
-    template = Record(
-        time,
-        {name: np.zeros(len(time)) for name in model.inputs},
-        {name: time for name in outputs},  # stands for readings that are not yet there
-        hold=so_far.hold,
-        constants={**so_far.constants, **{name: first.model.nominal[name] for name in changeable}},
-    )
-    space = Space(
-        time,
-        np.array([limits.between[name] for name in model.inputs]),
-        {name: np.array(pair) for name, pair in changeable.items()},
-    )
-    plan = None
-    for measured in [first.noise_variance, variances] if added else [variances]:
-        noise = {name: measured.get(name, np.inf) for name in outputs}
-        question = Question(
-            space,
-            tuple(explained(fit, [template] * _POPULATION, noise) for fit in fits.values()),
-            np.array(list(noise.values())),
-            np.array([_inside(watched.get(name)) for name in outputs]),
-            np.array([[(a, b) in apart for b in fits] for a in fits]),
-        )
-        plan = _planned(question, fits, apart, template, measured, variances, key, generations)
-        if plan.chosen.probability > 0.99:
-            break
-    assert plan is not None
-    return plan
-
-
-def _planned(question: Question, fits, apart, template: Record, measured, variances, key, generations: int) -> Plan:
-    """Return the plan with some outputs measured."""
-    single, space = _cast(question, jnp.float32), question.space
-    state, _ = search(
-        jax.tree_util.Partial(_cost, single),
-        key,
-        unknowns=space.genes,
-        population=_POPULATION,
+    question = Question(
+        fits=fits,
+        apart=apart,
+        limits=limits,
+        changeable=changeable,
+        own=_own(own, first),
+        variances=variances,
+        said_so_far={name: as_said_so_far(fit) for name, fit in fits.items()},
         generations=generations,
-        operators=Operators(),
-        tolerance=0.0,
     )
-    first = next(iter(fits.values()))
-    usual = {name: template.constants[name] for name in space.constants}
-    searched, simple = np.asarray(state.elites[:1], float), plain(space, usual)
-    chosen = [(searched[0], False)] if state.elite_cost[0] < _BROKEN else []
-    chosen += [(simple[i], True) for i in _worth_a_refit(simple, _costs(single, simple), len(space.constants))]
-    if not chosen:
+    options: list[Option] = []
+    for measured, count in itertools.product(
+        dict.fromkeys((tuple(first.noise_variance), tuple(variances))), dict.fromkeys((1, most_records))
+    ):
+        options += options_of(question, measured, count, key)
+        if options and best_of(options).probability > _CERTAIN:
+            break
+    if not options:
         raise ValueError(
             f"expected limits that some experiment keeps, got {', '.join(fits)} beyond them in all that were tried: "
             "give the inputs narrower ones, or the outputs wider ones"
         )
-
-    def separated(record: Record, names) -> dict[Pair, float]:
-        return {(a, b): refitted_separation(fits[a], fits[b], record, names, variances) for a, b in apart}
-
-    options = []
-    for genes, is_simple in chosen:
-        record, words = as_record(space, genes, first.model, template)
-        changed = sum(not np.isclose(record.constants[n], value) for n, value in usual.items())
-        words, names = f"{words}, measure {', '.join(measured)}", tuple(measured)
-        options.append(Option(words, record, names, separated(record, names), is_simple, changed))
     again, old = replace(first.records[0], outputs={}, name="again"), tuple(first.noise_variance)
     return Plan(
         chosen=best_of(options),
         options=ranked(options),
-        same_again=Option("the same experiment again", again, old, separated(again, old), True, 0),
-        today=separated(again, ()),
+        same_again=Option("the same experiment again", (again,), old, separated(question, (again,), old), True, 0),
+        today=separated(question, (again,), ()),
         explanations=dict(fits),
+        noise_variance=variances,
     )
-
-
-def _cost(question: Question, individuals: Float[Array, "experiment gene"]) -> Float[Array, " experiment"]:
-    """Return minus the share of what could be told apart of each experiment; `_BROKEN` and more beyond the limits.
-
-    A pair counts by its separation over that and the one at which it is all but sure: two explanations that no
-    experiment tells apart do not stand in the way of the others.
-    """
-    inputs, constants = realised(question.space, individuals)
-    every = [predicted(one, inputs, constants) for one in question.explanations]
-    pairs = itertools.permutations(range(len(every)), 2)
-    each = {(a, b): jnp.maximum(separations(every[a], every[b], question.noise_variance), 0.0) for a, b in pairs}
-    told = sum(jnp.where(question.apart[pair], d / (d + _SURE), 0.0) for pair, d in each.items())
-    lower, upper = question.watched.T[:, None, None]
-    beyond = [jnp.max(jnp.maximum(lower - one.outputs, one.outputs - upper), axis=(1, 2)) for one in every]
-    worst = jnp.max(jnp.stack(beyond), axis=0)
-    cost = jnp.where(worst > 0.0, _BROKEN + worst, -told / jnp.sum(question.apart))
-    return jnp.where(jnp.isfinite(told), cost, jnp.inf)
-
-
-_judged = jax.jit(_cost)
-
-
-def _costs(question: Question, genes: Float[np.ndarray, "experiment gene"]) -> Float[np.ndarray, " experiment"]:
-    """Return the costs of any number of experiments, in populations of one size, the last filled up."""
-    filled = np.concatenate([genes, np.repeat(genes[-1:], -len(genes) % _POPULATION, axis=0)]).astype(np.float32)
-    parts = np.split(filled, len(filled) // _POPULATION)
-    return np.concatenate([np.asarray(_judged(question, jnp.asarray(part))) for part in parts])[: len(genes)]
-
-
-def _worth_a_refit(genes, costs, constants: int) -> list[int]:
-    """Return the best few experiments that keep the limits, of different kinds, one with all constants as so far."""
-    order = [i for i in np.argsort(costs).tolist() if costs[i] < _BROKEN]
-    best: dict[int, int] = {}
-    for i in order:
-        best.setdefault(kind_of(genes[i]), i)
-    # The first of them are those with the constants as they were.
-    usual = [i for i in order if i < len(genes) // (1 + 2 * constants)]
-    return list(dict.fromkeys([*list(best.values())[:_SIMPLE], *usual[:1]]))
-
-
-def _cast(question: Question, dtype) -> Question:
-    """Return the question with its arrays on the device, in this precision."""
-
-    def converted(tree):
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), tree)
-
-    return Question(
-        space=converted(question.space),
-        explanations=tuple(
-            Explained(cast(one.problem, dtype), *converted(one[1:])) for one in question.explanations
-        ),
-        noise_variance=converted(question.noise_variance),
-        watched=converted(question.watched),
-        apart=jnp.asarray(question.apart),
-    )  # fmt: skip
-
-
-def _inside(pair) -> tuple[float, float]:
-    if pair is None:
-        return -np.inf, np.inf
-    margin = _MARGIN * (pair[1] - pair[0])
-    return pair[0] + margin, pair[1] - margin
 
 
 def _checked(explanations, limits) -> dict[str, Fit]:
@@ -255,6 +121,9 @@ def _checked(explanations, limits) -> dict[str, Fit]:
                 f"expected limits of inputs and outputs of {model.name}, {', '.join((*model.inputs, *model.outputs))}; "
                 f"got {name!r}"
             )
+    for name in limits.rates:
+        if name not in model.inputs:
+            raise ValueError(f"expected rates of inputs of {model.name}, {', '.join(model.inputs)}; got {name!r}")
     missing = [name for name in model.inputs if name not in limits.between]
     if missing:
         raise ValueError(
@@ -288,6 +157,22 @@ def _changeable(can_change, fits) -> dict[str, tuple[float, float]]:
                 )
         found[name] = as_pair(name, pair)
     return found
+
+
+def _own(own, first: Fit) -> Record | None:
+    """Return a record of the user's own signals, at the period of the records so far."""
+    if own is None:
+        return None
+    instance(
+        "own", own, Record, "make one with the inputs that you would try: ehsvjax.Record(time, {'command': values})"
+    )
+    missing = [name for name in first.model.inputs if name not in own.inputs]
+    if missing:
+        raise ValueError(f"expected own to have every input of {first.model.name}, got none of {', '.join(missing)}")
+    still = [name for name in first.model.inputs if np.ptp(own.inputs[name]) == 0.0]
+    if still:
+        raise ValueError(f"expected inputs of own that move, got {', '.join(still)} that stand still")
+    return own.resample(first.records[0].sample_period)
 
 
 def _output(model, name: str) -> str:

@@ -26,9 +26,10 @@ class Explained(NamedTuple):
     """One explanation, made ready to simulate many experiments with.
 
     Attributes:
-        problem: of the experiments side by side, its unknowns counted in their own sizes.
+        problem: of the records of experiments side by side, its unknowns counted in their own sizes.
         point: `[unknown]` of that problem.
-        directions: `[direction, unknown]` each parameter, and each initial condition in all experiments.
+        directions: `[direction, unknown]` each parameter, and each initial condition of each record of an experiment,
+            in all experiments.
         root: `[direction, direction]` of the directions' covariance as the records so far leave it.
 
     """
@@ -39,30 +40,33 @@ class Explained(NamedTuple):
     root: Float[Any, "direction direction"]
 
 
-def explained(fit: Fit, experiments: Sequence[Record], noise_variance: Mapping[str, float]) -> Explained:
+def explained(fit: Fit, records: Sequence[Record], experiments: int, noise_variance: Mapping[str, float]) -> Explained:
     """Return an explanation made ready.
 
     Args:
         fit: of its model to the records so far.
-        experiments: as many as are simulated side by side, alike in length; inputs and constants are put in later.
+        records: of one experiment, alike in length; inputs and constants are put in later.
+        experiments: how many are simulated side by side.
         noise_variance: of each output of theirs; +inf for one that is watched and not measured.
 
     """
     before = prepared(fit, "white")
     found = before.first_order.found
-    known = {n: v for n, v in fit.initial[0].items() if n not in fit.estimated_initial}
     measurable = {name: variance if np.isfinite(variance) else 1.0 for name, variance in noise_variance.items()}
-    problem = problem_of(fit.model, experiments, initial=known, noise_variance=measurable)
-    count, starts = len(problem.free), len(problem.free_initial)
-    widths = np.array([fit.model.parameter(n).upper - fit.model.parameter(n).lower for n in problem.free_initial])
+    known = known_initial(fit, 0, len(records) * experiments)
+    problem = problem_of(fit.model, list(records) * experiments, initial=known, noise_variance=measurable)
+    count, starts = len(problem.free), len(problem.free_initial) * len(records)
+    reach = {
+        n: fit.model.parameter(n).upper - fit.model.parameter(n).lower for n in (*problem.free, *problem.free_initial)
+    }
+    widths = np.array([reach[n] for n in problem.free_initial] * len(records))
     scale = np.concatenate([found.scale[:count], widths])
-    values = np.array([fit.parameters[n] for n in problem.free] + [fit.initial[0][n] for n in problem.free_initial])
-    each = np.concatenate([np.arange(count), np.tile(np.arange(count, count + starts), len(experiments))])
+    start = [fit.initial[0][n] for n in problem.free_initial] * len(records)
+    values = np.array([fit.parameters[n] for n in problem.free] + start)
+    each = np.concatenate([np.arange(count), np.tile(np.arange(count, count + starts), experiments)])
     # What is known of the parameters: by the records so far, and no less than by their bounds.
-    reach = (
-        np.array([fit.model.parameter(n).upper - fit.model.parameter(n).lower for n in problem.free]) / scale[:count]
-    )
-    information = _information(found.rows, count) / before.first_order.factor + np.diag(12.0 / reach**2)
+    bounds = np.array([reach[n] for n in problem.free]) / scale[:count]
+    information = _information(found.rows, count) / before.first_order.factor + np.diag(12.0 / bounds**2)
     covariance = np.zeros((count + starts, count + starts))
     covariance[:count, :count] = np.linalg.inv(information)
     covariance[count:, count:] = np.eye(starts)
@@ -74,6 +78,12 @@ def explained(fit: Fit, experiments: Sequence[Record], noise_variance: Mapping[s
         substeps=_finer(problem, fit),
     )
     return Explained(problem, (values / scale)[each], unknown.astype(float), np.linalg.cholesky(covariance))
+
+
+def known_initial(fit: Fit, so_far: int, new: int) -> list[dict[str, float]]:
+    """Return the initial conditions that are known of the first so many records so far, and of so many new ones."""
+    each = (*fit.initial[:so_far], *[fit.initial[0]] * new)
+    return [{n: v for n, v in one.items() if n not in fit.estimated_initial} for one in each]
 
 
 def _finer(problem: Problem, fit: Fit) -> np.int32:
@@ -95,7 +105,7 @@ class Predicted(NamedTuple):
     """What an explanation says that experiments will show.
 
     Attributes:
-        outputs: `[experiment, time, signal]`, in their units.
+        outputs: `[experiment, time, signal]`, in their units, the records of an experiment one after the other.
         slopes: `[direction, experiment, time, signal]` by what the records so far leave open.
 
     """
@@ -105,17 +115,21 @@ class Predicted(NamedTuple):
 
 
 def predicted(
-    explanation: Explained, inputs: Float[Array, "experiment time input"], constants: Mapping[str, Array]
+    explanation: Explained,
+    inputs: Float[Array, "experiment record time input"],
+    constants: Mapping[str, Float[Array, "experiment record"]],
 ) -> Predicted:
     """Return what an explanation predicts for experiments."""
     problem, point, directions, root = explanation
-    samples = problem.samples._replace(inputs=inputs, constants=dict(constants))
+    side_by_side = {name: values.reshape(-1) for name, values in constants.items()}
+    samples = problem.samples._replace(inputs=inputs.reshape(-1, *inputs.shape[2:]), constants=side_by_side)
     problem = replace(problem, samples=samples)
 
-    def along(direction):
-        return jax.jvp(lambda x: simulated(problem, x), (point,), (direction,))
+    def shown(x):
+        outputs = simulated(problem, x)
+        return outputs.reshape(len(inputs), -1, outputs.shape[-1])
 
-    outputs, slopes = jax.vmap(along, out_axes=(None, 0))(directions)
+    outputs, slopes = jax.vmap(lambda along: jax.jvp(shown, (point,), (along,)), out_axes=(None, 0))(directions)
     return Predicted(outputs, jnp.einsum("petn,pq->qetn", slopes, root))
 
 
@@ -132,47 +146,47 @@ def separations(
     return jnp.einsum("etn,etn->e", difference, difference) - taken
 
 
-def refitted_separation(
-    true: Fit, other: Fit, new: Record, outputs: Sequence[str], noise_variance: Mapping[str, float]
-) -> float:
-    """Return the separation that the records so far and a new one have together, the other explanation refitted.
-
-    Args:
-        true, other: fits to the same records.
-        new: the new record: inputs and constants.
-        outputs: names of those that are measured in it; none for what separates them by the records so far.
-        noise_variance: of each output that is measured, or was.
-
-    """
-    said = [true.simulate(record) for record in true.records]
-    records = [
-        replace(own, outputs={n: np.where(np.isfinite(y), one[n], np.nan) for n, y in own.outputs.items()})
-        for own, one in zip(other.records, said, strict=True)
+def as_said(fit: Fit, records: Sequence[Record], outputs: Sequence[str]) -> list[Record]:
+    """Return new records with what an explanation says that they will show."""
+    said = [fit.simulate(record, fit.initial[0]) for record in records]
+    return [
+        replace(record, outputs={name: one[name] for name in outputs})
+        for record, one in zip(records, said, strict=True)
     ]
-    future = true.simulate(new, true.initial[0])
-    records.append(replace(new, outputs={name: future[name] for name in noise_variance}))
-    return refitted_cost(other, records, noise_variance, outputs)
+
+
+def as_said_so_far(fit: Fit) -> list[Record]:
+    """Return the records that an explanation was fitted to with what it says of them, wherever they were measured."""
+    said = [fit.simulate(record) for record in fit.records]
+    return [
+        replace(record, outputs={n: np.where(np.isfinite(y), one[n], np.nan) for n, y in record.outputs.items()})
+        for record, one in zip(fit.records, said, strict=True)
+    ]
 
 
 def refitted_cost(
-    fit: Fit, records: Sequence[Record], noise_variance: Mapping[str, float], of_last: Sequence[str] | None = None
+    fit: Fit, records: Sequence[Record], noise_variance: Mapping[str, float], of_new: Sequence[str] | None = None
 ) -> float:
-    """Return the sum of squares, in noise variances, of an explanation that is refitted to its records and a new one.
+    """Return the sum of squares, in noise variances, of an explanation that is refitted to its records and new ones.
+
+    Where the records are as another explanation says (`as_said_so_far`, `as_said`), it is the separation of the two.
 
     Args:
         fit: from where it is refitted.
-        records: those that it was fitted to, or others in their place, and the new one.
+        records: those that it was fitted to, or others in their place, and the new ones.
         noise_variance: of each output.
-        of_last: outputs of the new record that count; by default all that it holds.
+        of_new: outputs of the new records that count; by default all that they hold.
 
     """
-    start = [*fit.initial, fit.initial[0]]
-    known = [{n: v for n, v in one.items() if n not in fit.estimated_initial} for one in start]
+    so_far, new = len(fit.records), len(records) - len(fit.records)
+    known = known_initial(fit, so_far, new)
     problem = problem_of(fit.model, records, initial=known, noise_variance=noise_variance)
     measured = problem.samples.measured.copy()
-    if of_last is not None:  # one program serves whatever is measured
-        measured[-1] &= np.array([name in of_last for name in problem.observed])
-    values = [fit.parameters[n] for n in problem.free] + [one[n] for one in start for n in problem.free_initial]
+    if of_new is not None:  # one program serves whatever is measured
+        measured[so_far:] &= np.array([name in of_new for name in problem.observed])
+    values = [fit.parameters[n] for n in problem.free] + [
+        one[n] for one in (*fit.initial, *[fit.initial[0]] * new) for n in problem.free_initial
+    ]
     unit = np.clip(to_unit(problem.coordinates, np.array(values)), 0.0, 1.0)[None]
     problem = replace(problem, substeps=_finer(problem, fit), samples=problem.samples._replace(measured=measured))
     with jax.enable_x64(True):

@@ -31,7 +31,8 @@ def design(
 
     Args:
         model: whose free parameters are to be identified.
-        records: the planned experiment, one or several: times and inputs. Outputs are not looked at.
+        records: the planned experiment, one or several: times and inputs. Where a record has outputs, those count as
+            measured, and where they are missing samples as that; else all that `noise_variance` names.
         noise_variance: name of each output that would be measured -> variance of its noise, unit squared.
         parameters: name -> value to expect; by default nominal.
         initial_values: name -> initial condition to expect; by default nominal.
@@ -45,7 +46,9 @@ def design(
     expected = []
     for record in records:
         simulated = simulate(model, record, parameters, initial_values)
-        expected.append(replace(record, outputs={name: simulated[name] for name in noise_variance}))
+        measured = record.outputs or {name: np.zeros(len(record)) for name in noise_variance}
+        outputs = {name: np.where(np.isfinite(y), simulated[name], np.nan) for name, y in measured.items()}
+        expected.append(replace(record, outputs=outputs))
     problem = problem_of(model, expected, initial=initial, noise_variance=noise_variance)
     point = _point(model, problem, parameters, initial_values)
     return precision_of(model, problem, linearised(problem, point, noise_variance_given=True, expected=True))

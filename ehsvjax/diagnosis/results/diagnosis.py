@@ -115,11 +115,21 @@ class Diagnosis:
 
         return plot_diagnosis(self)
 
-    def report(self, path: str | os.PathLike) -> None:
-        """Write one HTML page that needs no other file: misfit, suspects, verdict, extended model, gain, next step."""
+    def report(self, path: str | os.PathLike, plan: "Plan | None" = None) -> None:
+        """Write one HTML page that needs no other file: misfit, suspects, verdict, extended model, gain, next step.
+
+        Args:
+            path: the file, `.html`; its folder is made if need be.
+            plan: of the next experiment, which is then told and drawn there as well.
+
+        Raises:
+            ValueError: for what is no path or no plan.
+            OSError: if it cannot be written; a file that was there stays as it was.
+
+        """
         from ehsvjax.diagnosis.results.page import write_page
 
-        write_page(self, path)
+        write_page(self, path, plan)
 
     def next_experiment(
         self,
@@ -128,6 +138,8 @@ class Diagnosis:
         key: "Key[Array, '']",
         can_change: Mapping[str, tuple[float, float]] | None = None,
         can_add: Mapping[str, float] | None = None,
+        records: int = 1,
+        own: Record | None = None,
         against: Mapping[str, float] | None = None,
         generations: int = 20,
     ) -> "Plan":
@@ -141,6 +153,8 @@ class Diagnosis:
             key: random key, `jax.random.key(0)`.
             can_change: name of a constant of the model -> (least, most) that the rig can be set to, SI.
             can_add: name of an output that could be measured too -> variance of its noise, its unit squared.
+            records: how many short records may share the time.
+            own: a record whose inputs are tried as well.
             against: number of an effect -> its size, SI: `{"coulomb_friction.force": 50.0}`; every number of an effect.
             generations: of the search.
 
@@ -153,8 +167,9 @@ class Diagnosis:
 
         explanations, pairs = undecided_of(self) if against is None else doubts_of(self, against)
         return next_experiment(
-            explanations, limits, key=key, can_change=can_change, can_add=can_add, pairs=pairs, generations=generations
-        )
+            explanations, limits, key=key, can_change=can_change, can_add=can_add, records=records, own=own,
+            pairs=pairs, generations=generations,
+        )  # fmt: skip
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.

@@ -2,28 +2,38 @@
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from ehsvjax.checks import file_path
+from ehsvjax.checks import file_path, refused
 from ehsvjax.diagnosis.results import words
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 from ehsvjax.diagnosis.results.pictures import plot_diagnosis
 from ehsvjax.files import written_whole
 from ehsvjax.plots import embedded, plot_fit, to_png
 
+if TYPE_CHECKING:
+    from ehsvjax.experiment import Plan
+
 _HEADS = ("cause", "signal", "size", "unit", "score", "p, whole search", "gain", "smallest to be found", "looks like")
 
 
-def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
+def write_page(diagnosis: Diagnosis, path: str | os.PathLike, plan: "Plan | None") -> None:
     """Write the page.
 
     Args:
         diagnosis: what it tells of.
         path: the file, `.html`; its folder is made if need be.
+        plan: of the next experiment.
+
+    Raises:
+        ValueError: for what is no path or no plan.
 
     """
+    if plan is not None and not hasattr(plan, "chosen"):
+        raise refused("plan", "the plan of a next experiment", plan, "make it by diagnosis.next_experiment(...)")
     environment = Environment(
         loader=PackageLoader("ehsvjax.diagnosis.results", "."), autoescape=True, undefined=StrictUndefined
     )
@@ -41,6 +51,8 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike) -> None:
         tests=diagnosis.misfit.tests,
         tests_after=diagnosis.misfit.tests_after,
         extended=str(diagnosis.extended),
+        plan=None if plan is None else str(plan),
+        planned=None if plan is None else embedded(to_png(plan.plot())),
         picture=embedded(to_png(plot_diagnosis(diagnosis))),
         fitted=[embedded(to_png(plot_fit(diagnosis.extended, record))) for record in diagnosis.extended.records],
     )
