@@ -224,8 +224,10 @@ def predicted(fit: ehsvjax.Fit, records: Sequence[ehsvjax.Record]) -> str:
 def main() -> None:
     """Print each diagnosis and a table of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("rigs", nargs="*", choices=[*RIGS, []], default=list(RIGS), help=", ".join(RIGS))
-    chosen = parser.parse_args().rigs
+    parser.add_argument("rigs", nargs="*", help=f"of {', '.join(RIGS)}; by default all")
+    chosen = parser.parse_args().rigs or list(RIGS)
+    if unknown := set(chosen) - set(RIGS):
+        parser.error(f"expected rigs of {', '.join(RIGS)}; got {', '.join(unknown)}")
     if not DATA.is_dir():
         sys.exit(f"expected the measured records in {DATA}: set EHSVJAX_DATA to where they are")
     rows = []

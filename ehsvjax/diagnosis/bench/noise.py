@@ -65,7 +65,10 @@ class Noise(NamedTuple):
         return np.concatenate(parts, axis=-1)
 
     def gained(
-        self, left: Float[np.ndarray, "record time signal"], more: Float[np.ndarray, "record time signal"]
+        self,
+        left: Float[np.ndarray, "record time signal"],
+        more: Float[np.ndarray, "record time signal"],
+        spreads: Sequence[Float[np.ndarray, "direction record time signal"]] = (),
     ) -> float:
         """Return by how much one explanation's residual is less than another's, in variances of what is left.
 
@@ -79,6 +82,8 @@ class Noise(NamedTuple):
         Args:
             left: measured minus simulated, by the one; in the outputs' units. What is not finite is infinitely worse.
             more: by the other.
+            spreads: where they are predictions, by how much each may be off, in independent directions: the larger
+                variance along the difference adds to that of what is left.
 
         """
         both = self.scaled(left), self.scaled(more)
@@ -88,7 +93,8 @@ class Noise(NamedTuple):
         best, change = both[int(np.argmin(squares))], both[0] - both[1]
         if not change.any():
             return 0.0
-        return (squares[0] - squares[1]) / self.left_along(change, best)
+        off = [float(np.sum((self.scaled(spread) @ change) ** 2) / (change @ change)) for spread in spreads]
+        return (squares[0] - squares[1]) / (self.left_along(change, best) + max(off, default=0.0))
 
     def left_along(self, direction: Float[np.ndarray, " sample"], left: Float[np.ndarray, " sample"]) -> float:
         """Return the variance of what an explanation leaves, along a direction; both of scaled readings.

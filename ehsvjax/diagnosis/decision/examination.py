@@ -155,8 +155,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     if not better > price * term.pieces:
         return (term if better > -INSEPARABLE else None), False
     unused = predicted(bench, [()], nominal.points, noise, lambda known: told_by(bench, nominal, known, curve))
-    contradicted = unused.noise.gained(unused.residual[0], selection.unused.residual[0])
-    return term, bool(contradicted < INSEPARABLE)
+    return term, bool(selection.unused.better(0, unused, 0) < INSEPARABLE)
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:

@@ -19,12 +19,22 @@ class Predicted(NamedTuple):
 
     Attributes:
         residual: `[set, record, time, signal]` measured minus predicted.
+        spread: `[set, direction, record, time, signal]` what the readings that were used leave open of the prediction:
+            independent directions, each by its standard deviation.
         noise: of the model, for the readings that were predicted.
 
     """
 
     residual: Float[np.ndarray, "set record time signal"]
+    spread: Float[np.ndarray, "set direction record time signal"]
     noise: Noise
+
+    def better(self, k: int, than: "Predicted", j: int) -> float:
+        """Return by how much one set predicts better than a set of another, in variances of what may be left.
+
+        A prediction may be off by what its unknowns are uncertain by, which is no fault of the causes.
+        """
+        return self.noise.gained(than.residual[j], self.residual[k], [self.spread[k], than.spread[j]])
 
 
 def predicted(
@@ -59,22 +69,50 @@ def predicted(
         counted = np.cumsum(noise.measured[0].sum(axis=-1))
         later = np.zeros_like(noise.measured)
         later[:, int(np.searchsorted(counted, (1.0 - HELD_BACK) * counted[-1])) :] = True
-        return Predicted(refitted(~later)[1].residual, noise._replace(measured=noise.measured & later))
+        earlier = refitted(~later)[1]
+        spread = _spread(earlier, noise._replace(measured=noise.measured & ~later))
+        return Predicted(earlier.residual, spread, noise._replace(measured=noise.measured & later))
     residual = np.empty((len(sets), *noise.measured.shape))
+    spread = np.zeros((*columns.shape, *noise.measured.shape))
     for k in range(len(bench.records)):
         this = np.zeros_like(noise.measured)
         this[k] = True
-        residual[:, k] = _left_out(*refitted(~this), k, noise)[:, k]
-    return Predicted(residual, noise)
+        acting, others = refitted(~this)
+        itself = _left_out(acting, others, k, noise)
+        residual[:, k] = itself.residual[:, k]
+        spread[:, :, k] = _spread(others, noise._replace(measured=noise.measured & ~this), itself)[:, :, k]
+    return Predicted(residual, spread, noise)
 
 
-def _left_out(
-    bench: Workbench, others: Refits, record: int, noise: Noise
-) -> Float[np.ndarray, "set record time signal"]:
-    """Return the residuals of a record that was left out, its initial conditions refitted to it."""
+def _spread(
+    used: Refits, noise: Noise, refitted: Refits | None = None
+) -> Float[np.ndarray, "set direction record time signal"]:
+    """Return by how much predictions may be off, as the readings that were used leave it open.
+
+    Args:
+        used: refits to them.
+        noise: of them.
+        refitted: what was refitted to the readings that are predicted: it follows them.
+
+    """
+    found = np.empty_like(used.slopes)
+    for k, slopes in enumerate(used.slopes):
+        known = noise.scaled(slopes)
+        # No less is known of an unknown than its range.
+        information = known @ known.T / noise.along(known) + 12.0 * np.eye(len(known))
+        found[k] = np.tensordot(np.linalg.inv(np.linalg.cholesky(information)), slopes, 1)
+        if refitted is not None:
+            own = refitted.slopes[k].reshape(len(refitted.slopes[k]), -1).T
+            flat = found[k].reshape(len(found[k]), -1).T
+            found[k] = (flat - own @ np.linalg.lstsq(own, flat, rcond=None)[0]).T.reshape(found[k].shape)
+    return found
+
+
+def _left_out(bench: Workbench, others: Refits, record: int, noise: Noise) -> Refits:
+    """Return the refits of what a record that was left out has for itself, its initial conditions, to it."""
     points = others.points.copy()
     of_record = [j for j, name in enumerate(bench.problem.names) if name.endswith(f"[{record}]")]
     initial = [j for j in of_record if j in bench.base_columns]
     points[:, of_record] = np.where(np.isin(of_record, initial), points[:, of_record], bench.nominal[of_record])
     chosen = padded([initial] * len(points), max(len(initial), 1))
-    return refit(bench, points, chosen, noise.of_record(record), race=False).residual
+    return refit(bench, points, chosen, noise.of_record(record), race=False)

@@ -128,7 +128,7 @@ def _ranked(
             break
         points = np.concatenate([able[own].points, able[best].points])
         unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, noise)
-        if not unused.noise.gained(unused.residual[1], unused.residual[0]) > INSEPARABLE:
+        if not unused.better(0, unused, 1) > INSEPARABLE:
             break
         del able[best]
     ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))

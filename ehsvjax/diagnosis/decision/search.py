@@ -120,7 +120,7 @@ class Selection:
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
-        unused = self.unused._replace(residual=self.unused.residual[-1:])
+        unused = self.unused._replace(residual=self.unused.residual[-1:], spread=self.unused.spread[-1:])
         return replace(self, included=(), final=self.nominal, rivals=(), needs=(), unused=unused)
 
 
@@ -377,8 +377,7 @@ def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted)
     by more than chance.
     """
     spare = {}
-    for i, need, rest_predicts in zip(included, needs, unused.residual[1:], strict=False):
-        contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
-        spare[i] = min(need.gain - need.required, INSEPARABLE - contradicted)
+    for k, (i, need) in enumerate(zip(included, needs, strict=True)):
+        spare[i] = min(need.gain - need.required, INSEPARABLE - unused.better(k + 1, unused, 0))
     least = min(spare, key=lambda i: spare[i], default=None)
     return least if least is not None and spare[least] < 0.0 else None

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnosis.bench.evidence import corrected, smallest_p_values
+from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT, corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, unexplained
@@ -23,8 +23,6 @@ from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.hypotheses.harmonics import with_frequencies
 from ehsvjax.effects.effect import UNLIMITED, Candidate
 
-# Of records of noise alone, in which the best of all candidates may pass `Screening.threshold`.
-_FALSE_ALARMS = 1e-3
 # Share of a response that must be left after the refit of the unknowns: below is rounding.
 _SURVIVES = 1e-5
 
@@ -82,7 +80,7 @@ class Screening(NamedTuple):
     Attributes:
         ranked: those whose response survives, the most significant first.
         unseen: positions of candidates whose response does not survive a refit of the unknowns, or is none.
-        threshold: score of a single two-sided candidate that the search exceeds in one of a thousand records of noise.
+        threshold: score of one two-sided candidate that the search exceeds in `SIGNIFICANT` of records of noise.
 
     """
 
@@ -215,7 +213,7 @@ def screen(bench: Workbench, current: Refits, tried: Responses, noise: Noise, ha
             best[trial.candidate] = found
     ranked = tuple(sorted(best.values(), key=lambda s: (s.p_value, -abs(s.score))))
     unseen = tuple(sorted({t.candidate for t in tried.trials} - set(best)))
-    return Screening(ranked, unseen, float(-ndtri(0.5 * max(null[int(_FALSE_ALARMS * len(null))], 1e-12))))
+    return Screening(ranked, unseen, float(-ndtri(0.5 * max(null[int(SIGNIFICANT * len(null))], 1e-12))))
 
 
 def _basis(responses: Float[np.ndarray, "step sample"]) -> Float[np.ndarray, "sample step"]:
