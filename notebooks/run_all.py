@@ -32,6 +32,9 @@ def run(path: Path) -> None:
 
 # Threads of OpenBLAS that wait for each other in two kernels at once take half of the machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# What one has compiled, and the tests before it, need not be compiled again.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 chosen = [a for a in sys.argv[1:] if not a.startswith("-")] or ["*.ipynb"]
 paths = sorted({p for pattern in chosen for p in Path(__file__).parent.glob(pattern)})
 with ThreadPoolExecutor(2) as pool:

@@ -152,7 +152,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     price = float(np.log(noise.measured.sum()))
     better = noise.gained(selection.final.residual[0], term.residual)
     better += price * sum(_numbers(selection, i) for i in causes)
-    if not better > price * term.pieces:
+    if not better > price * term.pieces + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
     unused = predicted(bench, [()], nominal.points, noise, lambda known: told_by(bench, nominal, known, curve))
     return term, bool(selection.unused.better(0, unused, 0) < INSEPARABLE)
