@@ -1,4 +1,4 @@
-"""The demo, `python -m ehsvjax [--out DIR]`: the paper's two identifications again, and a hidden effect found."""
+"""The demo, `python -m ehsvjax [--out DIR]`: the paper's two identifications again, a hidden effect found, a plan."""
 
 import argparse
 import sys
@@ -13,6 +13,7 @@ import numpy as np
 
 from ehsvjax import effects, excitation, paper
 from ehsvjax.diagnosis import diagnose
+from ehsvjax.experiment import Limits
 from ehsvjax.identify import identify
 from ehsvjax.models import servovalve, van_der_pol
 from ehsvjax.paper import Identification
@@ -59,11 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _find_what_is_hidden(key, out: Path) -> Path:
-    """Hide hysteresis in a simulated valve, fit the model that has none, diagnose, and write picture and page.
+    """Hide hysteresis in a simulated valve, fit the model that has none, diagnose, plan, and write pictures and page.
 
     The valve is this package's own, at a quarter of its usual step; tests and benchmarks use plants of their own.
     """
-    excitation_key, noise_key, search_key, diagnosis_key = jax.random.split(key, 4)
+    excitation_key, noise_key, search_key, diagnosis_key, plan_key = jax.random.split(key, 5)
     timing = {"duration": 4.0, "sample_period": 1e-3}
     command = excitation.pseudo_random_signal(excitation_key, amplitude=6e-3, hold_time=0.2, **timing)
     clock = excitation.sample_times(**timing)
@@ -76,11 +77,22 @@ def _find_what_is_hidden(key, out: Path) -> Path:
     fit = identify(servovalve(), record, key=search_key, population=50, generations=20)
     print(f"  the model without it fits to {fit.fit_percent['position']:.2f} %")
     diagnosis = diagnose(fit, record, key=diagnosis_key, progress=sys.stderr.isatty())
-    for line in str(diagnosis).splitlines():
-        print(textwrap.fill(line.strip(), 100, initial_indent="  ", subsequent_indent="    "))
+    _print_folded(diagnosis)
+    print("\nIt would not show a piston that rubs with 1 kN. Which experiment would?")
+    plan = diagnosis.next_experiment(
+        Limits(command=(-6e-3, 6e-3), position=(-0.1, 0.1)), key=plan_key,
+        can_change={"supply_pressure": (70e5, 140e5)}, against={"coulomb_friction.force": 1e3}, generations=8,
+    )  # fmt: skip
+    _print_folded(plan)
     (out / "diagnosis.png").write_bytes(to_png(diagnosis.plot(), 110.0))
-    diagnosis.report(out / "diagnosis.html")
+    (out / "next_experiment.png").write_bytes(to_png(plan.plot(), 110.0))
+    diagnosis.report(out / "diagnosis.html", plan)
     return out / "diagnosis.html"
+
+
+def _print_folded(text: object) -> None:
+    for line in str(text).splitlines():
+        print(textwrap.fill(line.strip(), 100, initial_indent="  ", subsequent_indent="    "))
 
 
 def _identify_each(identify: Callable[..., Identification], key, noise_variances) -> list[Identification]:

@@ -181,11 +181,12 @@ def test_demo_writes_what_it_says(oscillator, valve, monkeypatch, tmp_path, caps
     demo.main(["--out", str(out)])
     assert sorted(path.name for path in out.iterdir()) == [
         *("diagnosis.html", "diagnosis.png", "figure_1.png", "figure_4.png", "figure_5.png"),
-        *("report.html", "table_1.csv", "table_2.csv"),
+        *("next_experiment.png", "report.html", "table_1.csv", "table_2.csv"),
     ]
     printed = capsys.readouterr().out
     assert str(out / "report.html") in printed
     assert "torque_motor_hysteresis" in printed
+    assert "Next: command: " in printed and "coulomb_friction against nothing more" in printed
     assert max(len(line) for line in printed.splitlines() if str(out) not in line) <= 100
 
     table = pd.read_csv(out / "table_2.csv")
@@ -193,7 +194,7 @@ def test_demo_writes_what_it_says(oscillator, valve, monkeypatch, tmp_path, caps
     assert table.loc[4, "saturation error %"] == pytest.approx(-33.3333)
 
     page = (out / "diagnosis.html").read_text(encoding="utf-8")
-    assert page.count('src="data:image/png;base64,') == 2
+    assert page.count('src="data:image/png;base64,') == 3
     assert needs_no_other_file(page)
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count('src="data:image/png;base64,') == 3

@@ -6,6 +6,7 @@ Many are simulated under every explanation at once; the best and a few plain one
 import itertools
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -96,18 +97,22 @@ def options_of(question: Question, measured: Sequence[str], count: int, key) -> 
     told = _separable(question, [template] * count, measured)
     space = told.space
     single = _cast(told, jnp.float32)
-    state, _ = search(
-        jax.tree_util.Partial(_cost, single),
-        key,
-        unknowns=count * space.genes,
-        population=_POPULATION,
-        generations=question.generations,
-        operators=Operators(),
-        tolerance=0.0,
-    )
     simple = plain(space, usual, count)
+    with ThreadPoolExecutor() as pool:  # most of it is compiling, on a core each
+        searching = pool.submit(
+            search,
+            jax.tree_util.Partial(_cost, single),
+            key,
+            unknowns=count * space.genes,
+            population=_POPULATION,
+            generations=question.generations,
+            operators=Operators(),
+            tolerance=0.0,
+        )
+        costs = _costs(single, simple)
+        state, _ = searching.result()
     chosen = [(np.asarray(state.elites[0], float), False)] if state.elite_cost[0] < _BROKEN else []
-    chosen += [(simple[i], True) for i in _worth_a_refit(space, simple, _costs(single, simple))]
+    chosen += [(simple[i], True) for i in _worth_a_refit(space, simple, costs)]
     options = []
     for genes, is_simple in chosen:
         records, words = as_records(space, genes, model, template)
@@ -137,11 +142,13 @@ def _separable(question: Question, records: Sequence[Record], measured: Sequence
     own = question.own
     signals = None if own is None else np.array([np.resize(own.inputs[n], len(time)) for n in model.inputs])
     noise = {name: question.variances[name] if name in measured else np.inf for name in outputs}
+    with ThreadPoolExecutor() as pool:
+        ready = tuple(pool.map(lambda fit: explained(fit, to_be_read, _POPULATION, noise), fits.values()))
     return Separable(
         Space(
             time, Reach(lower, upper, rates, signals), {n: np.array(pair) for n, pair in question.changeable.items()}
         ),
-        tuple(explained(fit, to_be_read, _POPULATION, noise) for fit in fits.values()),
+        ready,
         np.array(list(noise.values())),
         np.array([_inside(watched.get(name)) for name in outputs]),
         np.array([[(a, b) in question.apart for b in fits] for a in fits]),
@@ -152,10 +159,21 @@ def separated(question: Question, new: Sequence[Record], outputs: Sequence[str])
     """Return for each pair what the records so far and new ones, of which some outputs are measured, tell exactly."""
     fits, variances = question.fits, question.variances
     said = {a: as_said(fits[a], new, tuple(variances)) for a in dict.fromkeys(a for a, _ in question.apart)}
-    return {
-        (a, b): refitted_cost(fits[b], [*question.said_so_far[a], *said[a]], variances, outputs)
-        for a, b in question.apart
-    }
+
+    def by(other: str) -> dict[Pair, float]:
+        return {
+            (a, b): refitted_cost(fits[b], [*question.said_so_far[a], *said[a]], variances, outputs)
+            for a, b in question.apart
+            if b == other
+        }
+
+    with ThreadPoolExecutor() as pool:
+        found = {
+            pair: cost
+            for each in pool.map(by, dict.fromkeys(b for _, b in question.apart))
+            for pair, cost in each.items()
+        }
+    return {pair: found[pair] for pair in question.apart}
 
 
 def _cost(question: Separable, individuals: Float[Array, "experiment gene"]) -> Float[Array, " experiment"]:
