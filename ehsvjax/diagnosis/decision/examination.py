@@ -154,7 +154,8 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     better += price * sum(_numbers(selection, i) for i in causes)
     if not better > price * term.pieces + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
-    unused = predicted(bench, [()], nominal.points, noise, lambda known: told_by(bench, nominal, known, curve))
+    squares = np.sum(noise.scaled(term.residual[None]) ** 2, axis=1)
+    unused = predicted(bench, [()], nominal.points, squares, noise, lambda known: told_by(bench, nominal, known, curve))
     return term, bool(selection.unused.better(0, unused, 0) < INSEPARABLE)
 
 

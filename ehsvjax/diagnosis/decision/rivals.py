@@ -126,8 +126,9 @@ def _ranked(
         best = own if lowest[own] < lowest[best] + 1e-3 else best
         if best == own:
             break
-        points = np.concatenate([able[own].points, able[best].points])
-        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, noise)
+        points, left = (np.concatenate([getattr(able[i], n) for i in (own, best)]) for n in ("points", "residual"))
+        squares = np.sum(noise.scaled(left) ** 2, axis=1)
+        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, squares, noise)
         if not unused.better(0, unused, 1) > INSEPARABLE:
             break
         del able[best]

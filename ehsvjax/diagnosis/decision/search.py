@@ -120,7 +120,7 @@ class Selection:
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
-        unused = self.unused._replace(residual=self.unused.residual[-1:], spread=self.unused.spread[-1:])
+        unused = self.unused.of([-1])
         return replace(self, included=(), final=self.nominal, rivals=(), needs=(), unused=unused)
 
 
@@ -351,13 +351,13 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
     trials, final, noise = stage.trials, stage.current, stage.noise
     # All that is left may be chance as well: what a cause explains must stand out from that too.
     every_noise = noise, noise_of_all_left(trials.bench, final)
-    sets, points, needs = [stage.included], [final.points[0]], []
+    sets, refits, needs = [stage.included], [final], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
         refitted = refit_set(trials, start, rest, noise)
         sets.append(rest)
-        points.append(refitted.points[0])
+        refits.append(refitted)
         both = refitted.residual[0], final.residual[0]
         needs.append(Need(
             gain=surely_gained(every_noise, *both),
@@ -366,8 +366,9 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         ))  # fmt: skip
     if len(stage.included) > 1:
         sets.append(())
-        points.append(nominal.points[0])
-    return tuple(needs), predicted(trials.bench, sets, np.stack(points), noise)
+        refits.append(nominal)
+    points, left = (np.concatenate(each) for each in zip(*[(r.points, r.residual) for r in refits], strict=True))
+    return tuple(needs), predicted(trials.bench, sets, points, np.sum(noise.scaled(left) ** 2, axis=1), noise)
 
 
 def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted) -> int | None:
