@@ -154,9 +154,9 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     better += price * sum(_numbers(selection, i) for i in causes)
     if not better > price * term.pieces + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
-    squares = np.sum(noise.scaled(term.residual[None]) ** 2, axis=1)
-    unused = predicted(bench, [()], nominal.points, squares, noise, lambda known: told_by(bench, nominal, known, curve))
-    return term, bool(selection.unused.better(0, unused, 0) < INSEPARABLE)
+    unused = predicted(bench, [()], nominal.points, noise, lambda known: told_by(bench, nominal, known, curve))
+    contradicted = unused.noise.gained(unused.residual[0], selection.unused.residual[0])
+    return term, bool(contradicted < INSEPARABLE)
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:

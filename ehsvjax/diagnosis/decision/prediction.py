@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import Workbench
@@ -16,51 +15,22 @@ HELD_BACK = 0.3
 
 
 class Predicted(NamedTuple):
-    """Data that were not used, and what they say of sets of causes.
+    """Data that were not used.
 
     Attributes:
         residual: `[set, record, time, signal]` measured minus predicted.
         noise: of the model, for the readings that were predicted.
-        squares: `[set, part]` by how much each record in turn, or the last part of a single one, adds to the sum of
-            squares of a refit to all, in variances of the noise.
 
     """
 
     residual: Float[np.ndarray, "set record time signal"]
     noise: Noise
-    squares: Float[np.ndarray, "set part"]
-
-    def better(self, k: int, than: "Predicted", j: int) -> float:
-        """Return by how much the data that were not used speak for one set, and against a set of another.
-
-        The likelihood of all readings is that of those that were used times that of the others, given those: what the
-        others tell is what a refit to all gains, less what it gains on those that were used (Dawid 1984, "The
-        prequential approach"). An unknown that the used readings leave open is no fault of a prediction. In variances
-        of what is left along the difference of the predictions.
-        """
-        gained = float(np.sum(than.squares[j] - self.squares[k]))
-        return self.noise.as_gain(gained, than.residual[j], self.residual[k])
-
-    def left_open(self, record: int) -> bool:
-        """Whether a record speaks for the first set against the last, and yet is predicted worse by it.
-
-        The readings that were used then leave open what only all together fix.
-        """
-        of_record = self.noise.of_record(record)
-        worse = of_record.gained(self.residual[0], self.residual[-1])
-        gained = self.squares[-1] - self.squares[0]
-        return bool(worse > INSEPARABLE and gained[min(record, len(gained) - 1)] > INSEPARABLE)
-
-    def of(self, some: Sequence[int]) -> "Predicted":
-        """Return it for some of the sets."""
-        return self._replace(residual=self.residual[list(some)], squares=self.squares[list(some)])
 
 
 def predicted(
     bench: Workbench,
     sets: Sequence[Sequence[int]],
-    points: Float[np.ndarray, "set parameter"],
-    squares: Float[np.ndarray, " set"],
+    starts: Float[np.ndarray, "set parameter"],
     noise: Noise,
     told: Callable[[Noise], Workbench] | None = None,
 ) -> Predicted:
@@ -72,38 +42,30 @@ def predicted(
     Args:
         bench: the trials' workbench.
         sets: positions of the effects of each.
-        points: of each, refitted to all readings.
-        squares: sum of squares there, in variances of the noise.
+        starts: of each.
         noise: of what is left.
         told: what the readings of a noise tell of a term that acts besides, as a bench with it; by default none acts.
 
     """
+
+    def refitted(used: Bool[np.ndarray, "record time signal"]) -> tuple[Workbench, Refits]:
+        known = noise._replace(measured=noise.measured & used)
+        acting = bench if told is None else told(known)
+        return acting, refit(acting, starts, columns, known, race=False)
+
     own = [bench.columns_with(some) for some in sets]
     columns = padded(own, max(map(len, own)))
-    residual = np.full((len(sets), *noise.measured.shape), np.nan)
-    later = _later(noise.measured)
-    added = np.zeros((len(sets), len(later)))
-    for k, unused in enumerate(later):
-        known = noise._replace(measured=noise.measured & ~unused)
-        acting = bench if told is None else told(known)
-        used = refit(acting, points, columns, known, race=False)
-        added[:, k] = squares - used.cost
-        left = used.residual if len(later) == 1 else _left_out(acting, used, k, noise)
-        residual = np.where(unused, left, residual)
-    return Predicted(residual, noise._replace(measured=noise.measured & np.any(later, axis=0)), added)
-
-
-def _later(measured: Bool[np.ndarray, "record time signal"]) -> list[Bool[np.ndarray, "record time signal"]]:
-    """Return which readings are predicted in turn: each record, or the last of a single one."""
-    if len(measured) > 1:
-        return [
-            np.broadcast_to((np.arange(len(measured)) == k)[:, None, None], measured.shape)
-            for k in range(len(measured))
-        ]
-    counted = np.cumsum(measured[0].sum(axis=-1))
-    later = np.zeros_like(measured)
-    later[:, int(np.searchsorted(counted, (1.0 - HELD_BACK) * counted[-1])) :] = True
-    return [later]
+    if len(bench.records) == 1:
+        counted = np.cumsum(noise.measured[0].sum(axis=-1))
+        later = np.zeros_like(noise.measured)
+        later[:, int(np.searchsorted(counted, (1.0 - HELD_BACK) * counted[-1])) :] = True
+        return Predicted(refitted(~later)[1].residual, noise._replace(measured=noise.measured & later))
+    residual = np.empty((len(sets), *noise.measured.shape))
+    for k in range(len(bench.records)):
+        this = np.zeros_like(noise.measured)
+        this[k] = True
+        residual[:, k] = _left_out(*refitted(~this), k, noise)[:, k]
+    return Predicted(residual, noise)
 
 
 def _left_out(

@@ -126,10 +126,9 @@ def _ranked(
         best = own if lowest[own] < lowest[best] + 1e-3 else best
         if best == own:
             break
-        points, left = (np.concatenate([getattr(able[i], n) for i in (own, best)]) for n in ("points", "residual"))
-        squares = np.sum(noise.scaled(left) ** 2, axis=1)
-        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, squares, noise)
-        if not unused.better(0, unused, 1) > INSEPARABLE:
+        points = np.concatenate([able[own].points, able[best].points])
+        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, noise)
+        if not unused.noise.gained(unused.residual[1], unused.residual[0]) > INSEPARABLE:
             break
         del able[best]
     ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))

@@ -120,7 +120,7 @@ class Selection:
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
-        unused = self.unused.of([-1])
+        unused = self.unused._replace(residual=self.unused.residual[-1:])
         return replace(self, included=(), final=self.nominal, rivals=(), needs=(), unused=unused)
 
 
@@ -351,13 +351,13 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
     trials, final, noise = stage.trials, stage.current, stage.noise
     # All that is left may be chance as well: what a cause explains must stand out from that too.
     every_noise = noise, noise_of_all_left(trials.bench, final)
-    sets, refits, needs = [stage.included], [final], []
+    sets, points, needs = [stage.included], [final.points[0]], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
         refitted = refit_set(trials, start, rest, noise)
         sets.append(rest)
-        refits.append(refitted)
+        points.append(refitted.points[0])
         both = refitted.residual[0], final.residual[0]
         needs.append(Need(
             gain=surely_gained(every_noise, *both),
@@ -366,9 +366,8 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         ))  # fmt: skip
     if len(stage.included) > 1:
         sets.append(())
-        refits.append(nominal)
-    points, left = (np.concatenate(each) for each in zip(*[(r.points, r.residual) for r in refits], strict=True))
-    return tuple(needs), predicted(trials.bench, sets, points, np.sum(noise.scaled(left) ** 2, axis=1), noise)
+        points.append(nominal.points[0])
+    return tuple(needs), predicted(trials.bench, sets, np.stack(points), noise)
 
 
 def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted) -> int | None:
@@ -378,7 +377,8 @@ def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted)
     by more than chance.
     """
     spare = {}
-    for k, (i, need) in enumerate(zip(included, needs, strict=True)):
-        spare[i] = min(need.gain - need.required, INSEPARABLE - unused.better(k + 1, unused, 0))
+    for i, need, rest_predicts in zip(included, needs, unused.residual[1:], strict=False):
+        contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
+        spare[i] = min(need.gain - need.required, INSEPARABLE - contradicted)
     least = min(spare, key=lambda i: spare[i], default=None)
     return least if least is not None and spare[least] < 0.0 else None
