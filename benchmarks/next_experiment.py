@@ -226,9 +226,11 @@ def main() -> None:
         print((planned["said"].to_numpy()[:, None] / simple.clip(lower=1e-3)).median().round(2).to_string())
         errors = np.concatenate([np.asarray(row, float) for row in planned["errors"]])
         if len(errors):
-            print(
-                f"standard errors, said over came: {np.quantile(errors, [0.05, 0.5, 0.95]).round(2)} of {len(errors)}"
-            )
+            low, middle, high = np.quantile(errors, [0.05, 0.5, 0.95]).round(2)
+            print(f"standard errors, said over came: median {middle}, 90% from {low} to {high}, of {len(errors)}")
+        unseen = planned[planned["first"] == "not seen"]
+        shown = unseen["answer"].isin(["named", "in group"]) | (unseen["probability"] < 0.5)
+        print(f"not seen at first: {len(unseen)}; seen then, or said that nothing shows it: {int(shown.sum())}")
         print(f"within the limits: {int(planned['kept'].sum())} of {len(planned)}")
         print(f"seconds a plan: median {planned['seconds'].median():.0f}, at most {planned['seconds'].max():.0f}")
     columns = ["name", "variance", "first", "answer", "said", "came", "words"]

@@ -106,13 +106,11 @@ def test_what_a_record_exports_reads_back(way, tmp_path):
     frame, path = record.to_dataframe(), tmp_path / "file"
     assert list(frame.columns) == ["time", "command", "position"]
     arrays = {name: frame[name].to_numpy() for name in frame.columns}
-    with open(path, "wb") as file:
-        if way == "csv":
-            record.to_csv(path)
-        elif way == "npz":
-            np.savez(file, **arrays)
-        elif way == "mat":
-            savemat(file, arrays)
+    if way == "csv":
+        record.to_csv(path)
+    elif way != "dataframe":
+        with open(path, "wb") as file:
+            np.savez(file, **arrays) if way == "npz" else savemat(file, arrays)
     read = getattr(Record, f"from_{way}")
     source = frame if way == "dataframe" else path
     again = read(source, time="time", inputs={"command": "command"}, outputs={"position": "position"})

@@ -41,3 +41,14 @@ def test_what_the_search_takes_for_significant_earns_its_place():
     found = ehsvjax.diagnose(fit, record, key=KEY)
     assert found.verdict != "unexplained", str(found)
     assert "asymmetric_dead_zone" in {*found.names, *(name for a in found.alternatives for name in a.causes)}
+
+
+def test_a_straight_line_is_no_better_reason_than_two_effects_that_make_it():
+    """A bias and a compliance: one straight line along the load pressure, of 2.00002 pieces, was said to be better."""
+    pair = ("asymmetric_dead_zone", "structural_flexibility")
+    (made,) = records([Hidden("servovalve", "white", 1e-7, pair, 375512833)])
+    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
+    key = jax.random.key(375512833)
+    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=key, population=50, generations=20)
+    found = ehsvjax.diagnose(fit, record, key=key)
+    assert set(pair) <= {*found.names, *(name for a in found.alternatives for name in a.causes)}, str(found)
