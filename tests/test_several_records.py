@@ -172,3 +172,16 @@ def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_sett
     assert alone.verdict == "ambiguous" and "constant_load" in alone.alternatives[0].causes, str(alone)
     assert (together.verdict, together.names) == ("named", ("constant_load",)), str(together)
     assert together.extended.parameters["constant_load.force"] == pytest.approx(800.0, rel=0.1)
+
+
+@of_the_servovalve
+def test_what_each_record_alone_leaves_open_is_no_evidence_against_a_cause():
+    """Friction is a smaller flow gain at one supply pressure: no record predicts the other, and both fix its size."""
+    rubs = {"coulomb_friction": {"force": 650.0}}
+    records = [valve_stroke(7, 140e5, "full", **rubs), valve_stroke(8, 70e5, "half", **rubs)]
+    found = diagnose(fitted(ehsvjax.servovalve(), records), records, key=KEY)
+    suspected = {*found.names, *(name for a in found.alternatives for name in a.causes)}
+    assert "coulomb_friction" in suspected and found.innocent, str(found)
+    assert any(found.gain.left_open) and "(fitted with all, as the other records leave open" in str(found)
+    for outputs in found.gain.by_record:
+        assert outputs["position"].rmse_after < 0.9 * outputs["position"].rmse_before, str(found)

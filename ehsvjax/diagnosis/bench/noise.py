@@ -69,26 +69,37 @@ class Noise(NamedTuple):
     ) -> float:
         """Return by how much one explanation's residual is less than another's, in variances of what is left.
 
-        The difference of their sums of squares, over the variance of the better one's residual along what the two do
-        differently: that of the noise, or, if it is more, as it differs from part to part of the records. Where noise
-        alone is left, this is twice the logarithm of the likelihood ratio. Where more is left, whatever is flexible
-        gains by it, and what it gains in one part it loses in another (Wald's test with the covariance of White 1982,
-        "Maximum likelihood estimation of misspecified models", and for rivals Vuong 1989, "Likelihood ratio tests for
-        model selection and non-nested hypotheses", with parts for samples, as what is left is correlated).
+        Where noise alone is left, this is twice the logarithm of the likelihood ratio.
 
         Args:
             left: measured minus simulated, by the one; in the outputs' units. What is not finite is infinitely worse.
             more: by the other.
 
         """
-        both = self.scaled(left), self.scaled(more)
-        squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in both]
+        squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in map(self.scaled, (left, more))]
         if not all(map(np.isfinite, squares)):
             return 0.0 if squares[0] == squares[1] else squares[0] - squares[1]
-        best, change = both[int(np.argmin(squares))], both[0] - both[1]
+        return self.as_gain(squares[0] - squares[1], left, more)
+
+    def as_gain(
+        self,
+        squares: float,
+        left: Float[np.ndarray, "record time signal"],
+        more: Float[np.ndarray, "record time signal"],
+    ) -> float:
+        """Return a difference of two explanations' scaled squares in variances of what is left along the difference.
+
+        Along what the two do differently the better one leaves the noise, or, if it is more, what differs from part to
+        part of the records. Where more is left, whatever is flexible gains by it, and what it gains in one part it
+        loses in another (Wald's test with the covariance of White 1982, "Maximum likelihood estimation of misspecified
+        models", and for rivals Vuong 1989, "Likelihood ratio tests for model selection and non-nested hypotheses", with
+        parts for samples, as what is left is correlated).
+        """
+        both = self.scaled(left), self.scaled(more)
+        change = both[0] - both[1]
         if not change.any():
             return 0.0
-        return (squares[0] - squares[1]) / self.left_along(change, best)
+        return squares / self.left_along(change, min(both, key=lambda r: float(r @ r)))
 
     def left_along(self, direction: Float[np.ndarray, " sample"], left: Float[np.ndarray, " sample"]) -> float:
         """Return the variance of what an explanation leaves, along a direction; both of scaled readings.

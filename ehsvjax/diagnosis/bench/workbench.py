@@ -111,6 +111,14 @@ class Workbench:
         """How many numbers the effect of a candidate has."""
         return len(self.columns_of(self.candidates[candidate]))
 
+    def search_of(self, candidate: int) -> float:
+        """Noise variances that chance gains by a search for a frequency, where a candidate has one.
+
+        The largest of so many squares of two numbers each; 0 where nothing is searched.
+        """
+        frequencies = self.problem.samples.measured.sum() / 2
+        return float(2.0 * np.log(frequencies)) if self.candidates[candidate].effect.harmonic else 0.0
+
     def value(self, point: Float[np.ndarray, " parameter"], column: int) -> float:
         """Value of one unknown at a point, SI."""
         return float(to_values(self.problem.coordinates, point)[column])

@@ -142,19 +142,20 @@ def _must_be_better_by(selection: Selection, innocent: bool) -> float:
 def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
     """Return a term of free form that explains the record as well as all causes together, and whether better.
 
-    Like a cause, it is not better if unused data are predicted better without it: with the causes.
+    It is not better if unused data are predicted better without it, with the causes: what follows any data that it is
+    refitted to must at least predict.
     """
     causes = selection.included
     if not before or not causes or (innocent and len(causes) == 1):
         return None, False
     bench, noise, nominal = selection.bench, selection.noise, selection.nominal
     term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
-    price = float(np.log(noise.measured.sum()))
     better = noise.gained(selection.final.residual[0], term.residual)
-    better += price * sum(_numbers(selection, i) for i in causes)
-    if not better > price * term.pieces + INSEPARABLE:
+    better += sum(_price(selection, i) for i in causes)
+    if not better > float(np.log(noise.measured.sum())) * term.pieces + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
-    unused = predicted(bench, [()], nominal.points, noise, lambda known: told_by(bench, nominal, known, curve))
+    with_it = nominal._replace(residual=term.residual[None])
+    unused = predicted(bench, [()], [with_it], noise, lambda known: told_by(bench, nominal, known, curve))
     contradicted = unused.noise.gained(unused.residual[0], selection.unused.residual[0])
     return term, bool(contradicted < INSEPARABLE)
 
@@ -170,20 +171,19 @@ def _least_price(selection: Selection) -> float:
 
     What a rival fits worse counts as part of its price: two numbers that explain as much as one are no better.
     """
-    per_number = float(np.log(selection.bench.problem.samples.measured.sum()))
     cheapest = [
-        min(float(r.refitted.cost[0] - selection.final.cost[0]) + per_number * _numbers(selection, r.candidate)
+        min(float(r.refitted.cost[0] - selection.final.cost[0]) + _price(selection, r.candidate)
             for r in group if r.deficit < INSEPARABLE)
         for group in selection.rivals
     ]  # fmt: skip
-    return sum(cheapest) - per_number
+    return sum(cheapest) - float(np.log(selection.noise.measured.sum()))
 
 
-def _numbers(selection: Selection, candidate: int) -> int:
-    """Return the numbers of a cause for Bayes' price; a frequency counts for three, as a record fixes it so sharply.
+def _price(selection: Selection, candidate: int) -> float:
+    """Return Bayes' price for the numbers of a cause, and for the search where it has a frequency.
 
-    Its information grows with the third power of the record's length (Djuric 1996, "A model selection rule for
-    sinusoids in white Gaussian noise").
+    A record fixes a frequency sharply: its information grows with the third power of the record's length (Djuric 1996,
+    "A model selection rule for sinusoids in white Gaussian noise").
     """
-    bench = selection.bench
-    return bench.numbers_of(candidate) + 2 * bench.candidates[candidate].effect.harmonic
+    per_number = float(np.log(selection.noise.measured.sum()))
+    return per_number * selection.bench.numbers_of(candidate) + selection.bench.search_of(candidate)

@@ -30,13 +30,13 @@ _WORTH_A_REFIT = 100.0
 
 
 def price(bench: Workbench, candidate: int, point: Float[np.ndarray, " parameter"]) -> float:
-    """Return the noise variances that a candidate must bring beyond another to come before it: numbers and rarity.
+    """Return the noise variances that a candidate must bring to come before another: for its numbers, search, rarity.
 
     A constant that was given wrong, the commonest cause of all, may be off by any factor; a sensor hardly by a third.
     """
     unknowns = bench.unknowns_of(bench.candidates[candidate])
     rarest = max(number.rarity(bench.value(point, j)) for number, j in unknowns if number.absent is not None)
-    return PER_NUMBER * (bench.numbers_of(candidate) + rarest)
+    return PER_NUMBER * (bench.numbers_of(candidate) + rarest) + bench.search_of(candidate)
 
 
 class Rival(NamedTuple):
@@ -126,9 +126,8 @@ def _ranked(
         best = own if lowest[own] < lowest[best] + 1e-3 else best
         if best == own:
             break
-        points = np.concatenate([able[own].points, able[best].points])
-        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], points, noise)
-        if not unused.noise.gained(unused.residual[1], unused.residual[0]) > INSEPARABLE:
+        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], [able[own], able[best]], noise)
+        if not unused.against(1, 0) > INSEPARABLE:
             break
         del able[best]
     ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))

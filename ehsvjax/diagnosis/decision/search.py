@@ -120,7 +120,7 @@ class Selection:
 
     def without_causes(self) -> "Selection":
         """Return it with the nominal model alone."""
-        unused = self.unused._replace(residual=self.unused.residual[-1:])
+        unused = self.unused.of([-1])
         return replace(self, included=(), final=self.nominal, rivals=(), needs=(), unused=unused)
 
 
@@ -248,9 +248,8 @@ def _compared(final: Refits, nominal: Refits, rivals: Sequence[Sequence[Rival]])
 
 def required_gain(bench: Workbench, screening: Screening, candidate: int) -> float:
     """Return the likelihood ratio that an effect must bring, in noise variances, for the search that found it."""
-    if bench.candidates[candidate].effect.harmonic:
-        frequencies = bench.problem.samples.measured.sum() / 2
-        return float(2.0 * np.log(frequencies / SIGNIFICANT)) + PER_NUMBER
+    if searched := bench.search_of(candidate):
+        return searched - 2.0 * float(np.log(SIGNIFICANT)) + PER_NUMBER
     return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
 
 
@@ -351,13 +350,13 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
     trials, final, noise = stage.trials, stage.current, stage.noise
     # All that is left may be chance as well: what a cause explains must stand out from that too.
     every_noise = noise, noise_of_all_left(trials.bench, final)
-    sets, points, needs = [stage.included], [final.points[0]], []
+    sets, refits, needs = [stage.included], [final], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
         start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
         refitted = refit_set(trials, start, rest, noise)
         sets.append(rest)
-        points.append(refitted.points[0])
+        refits.append(refitted)
         both = refitted.residual[0], final.residual[0]
         needs.append(Need(
             gain=surely_gained(every_noise, *both),
@@ -366,8 +365,8 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         ))  # fmt: skip
     if len(stage.included) > 1:
         sets.append(())
-        points.append(nominal.points[0])
-    return tuple(needs), predicted(trials.bench, sets, np.stack(points), noise)
+        refits.append(nominal)
+    return tuple(needs), predicted(trials.bench, sets, refits, noise)
 
 
 def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted) -> int | None:
@@ -377,8 +376,7 @@ def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted)
     by more than chance.
     """
     spare = {}
-    for i, need, rest_predicts in zip(included, needs, unused.residual[1:], strict=False):
-        contradicted = unused.noise.gained(unused.residual[0], rest_predicts)
-        spare[i] = min(need.gain - need.required, INSEPARABLE - contradicted)
+    for k, (i, need) in enumerate(zip(included, needs, strict=True)):
+        spare[i] = min(need.gain - need.required, INSEPARABLE - unused.against(0, k + 1))
     least = min(spare, key=lambda i: spare[i], default=None)
     return least if least is not None and spare[least] < 0.0 else None

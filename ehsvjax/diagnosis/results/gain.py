@@ -44,6 +44,8 @@ class Gain(NamedTuple):
         by_record: the same of each record, in their order.
         records: their names.
         on: says on which data.
+        left_open: for each, whether the others leave open how large the causes are: it is not predicted but fitted, by
+            both models, with them.
 
     """
 
@@ -51,6 +53,7 @@ class Gain(NamedTuple):
     by_record: tuple[dict[str, OutputGain], ...]
     records: tuple[str, ...]
     on: str
+    left_open: tuple[bool, ...]
 
 
 class _Judged(NamedTuple):
@@ -72,17 +75,18 @@ def gain_of(
     """Return the gain on validation records; without any, on each record, predicted from the others or its own past."""
     records = validation or selection.bench.records
     names = tuple(record.name for record in records)
+    left_open = tuple(not validation and selection.unused.left_open(k) for k in range(len(records)))
     if validation:
         judged = [_validated(selection, nominal, extended, record) for record in validation]
         on = f"{', '.join(names)}, which {'was' if len(names) == 1 else 'were'} not used"
     else:
-        judged = [_of_record(selection, k) for k in range(len(records))]
+        judged = [_of_record(selection, k, fitted) for k, fitted in enumerate(left_open)]
         on = "each record, predicted from the others"
         if len(records) == 1:
             on = f"the last {HELD_BACK:.0%} of the record, which was held back"
     by_record = _gains(judged, rng)
     outputs = by_record[0] if len(judged) == 1 else _gains([_together(judged)], rng)[0]
-    return Gain(outputs, tuple(by_record), names, on)
+    return Gain(outputs, tuple(by_record), names, on, left_open)
 
 
 def _gains(judged: Sequence[_Judged], rng) -> list[dict[str, OutputGain]]:
@@ -121,12 +125,13 @@ def _validated(selection: Selection, nominal: Fit, extended: Fit, record: Record
     )
 
 
-def _of_record(selection: Selection, record: int) -> _Judged:
-    """Return one record, or the part of it that was not used."""
+def _of_record(selection: Selection, record: int, fitted: bool) -> _Judged:
+    """Return one record, or the part of it that was not used: predicted, or fitted with all."""
     bench, noises, unused = selection.bench, selection.noise.of[record], selection.unused
     there = unused.noise.measured[record].any(axis=-1)
     kept = np.where(unused.noise.measured[record], 1.0, np.nan)[there]
-    before, after = (residual[record, there] * kept for residual in unused.residual[[-1, 0]])
+    both = [selection.nominal.residual[0], selection.final.residual[0]] if fitted else unused.residual[[-1, 0]]
+    before, after = (residual[record, there] * kept for residual in both)
     readings = bench.problem.samples.outputs[record, there] * kept
     named = [(i, n) for i, n in enumerate(bench.problem.observed) if n in bench.records[record].outputs]
     return _Judged(

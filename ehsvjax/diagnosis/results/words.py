@@ -1,6 +1,6 @@
 """A diagnosis in sentences."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -236,18 +236,30 @@ def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
 
 def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Any]]:
     """Return what there is of each output in each record, with the names of both; of a single record without."""
-    said = [f"{name}, " if len(names) > 1 else "" for name in names]
+    said = [f"{name}, " if name else "" for name in names]
     return [(name, output, m) for name, outputs in zip(said, by_record, strict=True) for output, m in outputs.items()]
 
 
 def _names(diagnosis: "Diagnosis") -> list[str]:
-    return [record.name for record in diagnosis.records]
+    return _told(record.name for record in diagnosis.records)
+
+
+def _told(names: Iterable[str]) -> list[str]:
+    """Return the names of records as a line tells them: a single one needs none."""
+    names = list(names)
+    return names if len(names) > 1 else [""]
 
 
 def gain_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what the extension gains, a line for each output."""
-    lines = []
-    for record, name, g in _of_each(diagnosis.gain.records, diagnosis.gain.by_record):
+    lines, gain = [], diagnosis.gain
+    others = "the other records leave" if len(gain.records) > 1 else "the rest leaves"
+    fitted = f"(fitted with all, as {others} open how large the causes are)"
+    names = [
+        f"{name} {fitted}".strip() if left_open else name
+        for name, left_open in zip(_told(gain.records), gain.left_open, strict=True)
+    ]
+    for record, name, g in _of_each(names, gain.by_record):
         unit = _spaced(diagnosis.fit.model.unit(name))
         if diagnosis.extended.model.name == diagnosis.fit.model.name:
             lines.append(
