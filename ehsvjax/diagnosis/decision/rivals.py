@@ -18,7 +18,7 @@ from ehsvjax.diagnosis.decision.trials import (
     refit_screened,
     refit_set,
     refit_sets,
-    without,
+    with_only,
 )
 from ehsvjax.diagnosis.hypotheses.screening import Screened, responses_at, screen
 
@@ -90,7 +90,7 @@ def rivals_again(
 def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, noise: Noise) -> tuple[Rival, ...]:
     """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
-    start = without(bench, final.points[0], own)
+    start = with_only(bench, final.points[0], rest)
     current = refit_set(trials, start, rest, noise)
     base = _beside(trials, start, current, noise) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.

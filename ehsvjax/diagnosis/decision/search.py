@@ -24,7 +24,6 @@ from ehsvjax.diagnosis.decision.trials import (
     refit_screened,
     refit_set,
     trials_of,
-    without,
 )
 from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, responses_at, screen
 
@@ -149,9 +148,8 @@ def select(bench: Workbench, progress: Progress) -> Selection:
     while weighed.needless is not None:
         # What was added first can become needless by what was added later.
         last = weighed.stage
-        start = without(last.trials.bench, last.current.points[0], weighed.needless)
         rest = tuple(j for j in last.included if j != weighed.needless)
-        refitted = refit_set(last.trials, start, rest, last.noise)
+        refitted = refit_set(last.trials, last.current.points[0], rest, last.noise)
         weighed = _weighed(_look(last.trials, rest, refitted, last.noise), nominal)
     last = weighed.stage
     return Selection(
@@ -353,11 +351,9 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
     sets, refits, needs = [stage.included], [final], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
-        start = without(trials.bench, final.points[0], i) if rest else nominal.points[0]
-        refitted = refit_set(trials, start, rest, noise)
         sets.append(rest)
-        refits.append(refitted)
-        both = refitted.residual[0], final.residual[0]
+        refits.append(refit_set(trials, final.points[0] if rest else nominal.points[0], rest, noise))
+        both = refits[-1].residual[0], final.residual[0]
         needs.append(Need(
             gain=surely_gained(every_noise, *both),
             of_record=tuple(noise.of_record(k).gained(*both) for k in range(len(trials.bench.records))),

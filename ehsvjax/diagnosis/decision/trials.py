@@ -75,10 +75,13 @@ def refit_sets(
     """Refit each set of effects from each of its starts, and from where it has been refitted before; return the best.
 
     Where it was before is better than any start, and may yet be a local minimum: all are refitted. In a race, what
-    falls far behind the best is given up.
+    falls far behind the best is given up. Of a start that has other effects too, nothing of these is kept.
     """
     bench = trials.bench
-    choices = [_different([*some, *_before(trials, s)]) for some, s in zip(starts, sets, strict=True)]
+    choices = [
+        _different([with_only(bench, point, s) for point in (*some, *_before(trials, s))])
+        for some, s in zip(starts, sets, strict=True)
+    ]
     of = np.repeat(np.arange(len(sets)), [len(choice) for choice in choices])
     columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
     led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], noise, race=race)
@@ -141,14 +144,11 @@ def refit_reshaped(trials: Trials, current: Refits, included: Sequence[int], can
     return best
 
 
-def without(
-    bench: Workbench, point: Float[np.ndarray, " parameter"], candidate: int
+def with_only(
+    bench: Workbench, point: Float[np.ndarray, " parameter"], included: Sequence[int]
 ) -> Float[np.ndarray, " parameter"]:
-    """Return the point with an effect absent."""
-    own = bench.columns_of(bench.candidates[candidate])
-    point = point.copy()
-    point[own] = bench.nominal[own]
-    return point
+    """Return the point with all effects absent but some."""
+    return np.where(np.isin(np.arange(len(point)), bench.columns_with(included)), point, bench.nominal)
 
 
 def _before(trials: Trials, included: Sequence[int]) -> list[Float[np.ndarray, " parameter"]]:
