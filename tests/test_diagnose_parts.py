@@ -349,3 +349,13 @@ def test_beside_slow_misfit_a_slow_difference_is_not_sure():
     least = surely_gained([white, of_all], other, best)
     assert abs(least) <= abs(white.gained(other, best)) and abs(least) <= abs(of_all.gained(other, best))
     assert surely_gained([white, of_all], best, best) == 0.0
+
+
+@pytest.mark.parametrize("direction", [np.sin(np.linspace(0.0, 40.0, 2000)), np.linspace(0.0, 1.0, 2000) ** 4])
+def test_parts_of_a_record_count_only_where_they_differ_by_more_than_chance(direction):
+    """What is left under noise alone was taken for 1.2 noise variances on average: weak causes were lost by it."""
+    noise = plain_noise(np.array([1.0]), np.ones((1, 2000, 1), bool))
+    draws = np.random.default_rng(0).standard_normal((1000, 2000))
+    assert np.mean([noise.left_along(direction, draw) > 1.0 for draw in draws]) < 0.006
+    misfit = np.sin(np.linspace(0.0, 7.0, 2000))
+    assert min(noise.left_along(direction, draw + misfit) for draw in draws[:100]) > 3.0

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.precision.residual_noise import (
     ResidualNoise,
     autocovariance,
@@ -89,11 +90,11 @@ class Noise(NamedTuple):
     ) -> float:
         """Return a difference of two explanations' scaled squares in variances of what is left along the difference.
 
-        Along what the two do differently the better one leaves the noise, or, if it is more, what differs from part to
-        part of the records. Where more is left, whatever is flexible gains by it, and what it gains in one part it
-        loses in another (Wald's test with the covariance of White 1982, "Maximum likelihood estimation of misspecified
-        models", and for rivals Vuong 1989, "Likelihood ratio tests for model selection and non-nested hypotheses", with
-        parts for samples, as what is left is correlated).
+        Along what the two do differently the better one leaves the noise, or, if it is surely more, what differs from
+        part to part of the records. Where more is left, whatever is flexible gains by it, and what it gains in one part
+        it loses in another (Wald's test with the covariance of White 1982, "Maximum likelihood estimation of
+        misspecified models", and for rivals Vuong 1989, "Likelihood ratio tests for model selection and non-nested
+        hypotheses", with parts for samples, as what is left is correlated).
         """
         both = self.scaled(left), self.scaled(more)
         change = both[0] - both[1]
@@ -104,10 +105,16 @@ class Noise(NamedTuple):
     def left_along(self, direction: Float[np.ndarray, " sample"], left: Float[np.ndarray, " sample"]) -> float:
         """Return the variance of what an explanation leaves, along a direction; both of scaled readings.
 
-        That of the noise, or, if it is more, as it differs from part to part of the records.
+        That of the noise, or, if it is more and not by chance, as it differs from part to part of the records: of a sum
+        of squares of as many independent parts as the direction lies in (Satterthwaite 1946).
         """
-        between_parts = float(np.sum(np.bincount(self._part_of, direction * left) ** 2)) / float(direction @ direction)
-        return max(self.along(direction), between_parts)
+        from scipy.special import chdtrc
+
+        of_noise = self.along(direction)
+        shares = np.bincount(self._part_of, direction**2) / float(direction @ direction)
+        parts = 1.0 / float(shares @ shares)
+        between = float(np.sum(np.bincount(self._part_of, direction * left) ** 2)) / float(direction @ direction)
+        return between if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT else of_noise
 
     def of_record(self, record: int) -> "Noise":
         """Return the noise with the readings of one record alone."""
