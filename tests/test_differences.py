@@ -43,6 +43,8 @@ def test_a_parameter_that_was_identified_and_changed_is_told():
     assert found.names == ("change_of_damping",), str(found)
     first, second = (1.0 + s.value for s in found.causes[0].sizes)
     assert second / first == pytest.approx(1.5, rel=0.05)
+    # What both records have in common the parameter says: beside it each change would be open, with any error.
+    assert all(0.0 < s.standard_error < 0.02 for s in found.causes[0].sizes), str(found)
 
 
 def test_a_zero_that_moved_between_records_is_told():

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax import arithmetic
-from ehsvjax.effects.effect import Candidate, EffectParameter, Scales
+from ehsvjax.effects.effect import Candidate, EffectParameter, Scales, constant_of
 from ehsvjax.effects.extended import effects_in_the_loop, switch
 from ehsvjax.effects.internal import Internal
 from ehsvjax.fit import Fit
@@ -100,8 +100,15 @@ class Workbench:
         return [j for _, j in self.unknowns_of(candidate)]
 
     def columns_with(self, included: Sequence[int]) -> list[int]:
-        """Columns of the nominal model's unknowns and of some candidates' numbers, by their positions."""
-        return [*self.base_columns, *(j for i in included for j in self.columns_of(self.candidates[i]))]
+        """Columns of the nominal model's unknowns and of some candidates' numbers, by their positions.
+
+        Of a parameter that is another in every record, what all have in common is none besides: it does the same.
+        """
+        some = [self.candidates[i] for i in included]
+        changed = [constant_of(c.effect) for c in some if c.effect.by_record and c.effect.kind == "constant"]
+        replaced = {self.column.get(name) for name in changed}
+        base = [j for j in self.base_columns if j not in replaced]
+        return [*base, *(j for c in some for j in self.columns_of(c))]
 
     def of_each(self, candidate: int) -> bool:
         """Whether a candidate, by its position, is something that each of several records has for itself."""
