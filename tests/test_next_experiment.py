@@ -18,7 +18,7 @@ from ehsvjax.experiment.commands import Reach
 from ehsvjax.experiment.plan import Option, best_of, told_apart
 from ehsvjax.experiment.separation import as_said, as_said_so_far, explained, predicted, refitted_cost, separations
 from tests.hidden_plants import held_levels
-from tests.small_models import STIFFNESS, carriage, carriage_plant
+from tests.small_models import MASS, STIFFNESS, carriage, carriage_plant
 
 KEY = jax.random.key(2)
 PERIOD, NOISE = 0.02, 1e-3
@@ -61,14 +61,14 @@ def plan(fits):
     return next_experiment(fits, LIMITS, key=KEY, generations=4)
 
 
-def by_scipy(fits, new, true=STIFFNESS, other=STIFFER):
+def by_scipy(fits, new, true=STIFFNESS, other=STIFFER, **constants):
     """The same separation by SciPy's linear systems and least squares, the damping refitted."""
     damping = fits[SOFT if true == STIFFNESS else HARD].parameters["damping"]
     pushes = [fits[SOFT].records[0].inputs["push"], *new]
-    shown = [carriage_plant(u, PERIOD, stiffness=true, damping=damping)[:, 0] for u in pushes]
+    shown = [carriage_plant(u, PERIOD, stiffness=true, damping=damping, **constants)[:, 0] for u in pushes]
 
     def left(x):
-        refitted = [carriage_plant(u, PERIOD, stiffness=other, damping=x[0])[:, 0] for u in pushes]
+        refitted = [carriage_plant(u, PERIOD, stiffness=other, damping=x[0], **constants)[:, 0] for u in pushes]
         return (np.concatenate(refitted) - np.concatenate(shown)) / NOISE
 
     return 2.0 * least_squares(left, [damping]).cost
@@ -204,6 +204,15 @@ def test_a_limit_of_the_rate_is_kept_and_told(fits):
     found = next_experiment(fits, limits, key=KEY, generations=2)
     assert all(np.abs(np.diff(o.records[0].inputs["push"])).max() <= 5.0 * PERIOD * 1.0001 for o in found.options)
     assert "no faster than 5 N a second" in found.chosen.words
+
+
+def test_what_was_set_on_the_rig_stays_set(fits):
+    """A mass that the records so far were told, and the model does not have, is that of the next one."""
+    loaded = {n: dataclasses.replace(f, records=(f.records[0].at(mass=1.4 * MASS),)) for n, f in fits.items()}
+    found = next_experiment(loaded, LIMITS, key=KEY, generations=2)
+    assert all(r.constants == {"mass": 1.4 * MASS} for option in found.options for r in option.records)
+    expected = by_scipy(loaded, [found.command], mass=1.4 * MASS)
+    assert found.chosen.separations[SOFT, HARD] == pytest.approx(expected, rel=0.03)
 
 
 def test_a_signal_of_ones_own_is_tried_as_it_is(fits):
