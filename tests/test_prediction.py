@@ -84,7 +84,7 @@ def two_records_that_fix_two_numbers_together(noise, size):
         return readings - (some @ np.linalg.lstsq(some[used], readings[:, used].T, rcond=None)[0]).T
 
     sets = columns, columns[:, :1]
-    fitted = np.stack([left(some, first | True) for some in sets], axis=1)
+    fitted = np.stack([left(some, slice(None)) for some in sets], axis=1)
     others = [np.stack([left(some, used) for some in sets], axis=1) for used in (~first, first)]
     predicted = np.where(first, *others)
     squares = [

@@ -111,9 +111,10 @@ class Noise(NamedTuple):
         from scipy.special import chdtrc
 
         of_noise = self.along(direction)
-        shares = np.bincount(self._part_of, direction**2) / float(direction @ direction)
+        part_of, squares = self._part_of, float(direction @ direction)
+        shares = np.bincount(part_of, direction**2) / squares
         parts = 1.0 / float(shares @ shares)
-        between = float(np.sum(np.bincount(self._part_of, direction * left) ** 2)) / float(direction @ direction)
+        between = float(np.sum(np.bincount(part_of, direction * left) ** 2)) / squares
         return between if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT else of_noise
 
     def of_record(self, record: int) -> "Noise":

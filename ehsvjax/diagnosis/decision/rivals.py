@@ -103,7 +103,7 @@ def _ranked(
 ) -> tuple[Rival, ...]:
     """Return what was refitted in the place of an effect, the best first, with how much worse each is.
 
-    What would take its place, and predicts unused data worse by more than chance, is no rival.
+    What would take its place, and has unused data against it by more than chance, is no rival.
     """
     able = {candidate: refitted for candidate, refitted in found.items() if np.isfinite(_cost(refitted))}
     prices = {candidate: price(trials.bench, candidate, refitted.points[0]) for candidate, refitted in able.items()}

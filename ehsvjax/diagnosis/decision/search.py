@@ -368,8 +368,8 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
 def _needless(included: Sequence[int], needs: Sequence[Need], unused: Predicted) -> int | None:
     """Return the effect that is needed least, if it is needless; None if all are needed.
 
-    It is needless if it gains less than chance could, or if data that were not used are predicted better without it
-    by more than chance.
+    It is needless if it gains less than chance could, or if data that were not used speak against it by more than
+    chance.
     """
     spare = {}
     for k, (i, need) in enumerate(zip(included, needs, strict=True)):
