@@ -56,3 +56,13 @@ def test_what_was_of_one_sweep_is_not_predicted_of_the_other():
     found = ehsvjax.diagnose(fit, one, key=jax.random.key(1))
     assert {"input_hysteresis", "sensor_lag"} <= {*found.names, *(c for a in found.alternatives for c in a.causes)}
     assert found.extended.score(other).rmse["flow"] < fit.score(other).rmse["flow"], str(found)
+
+
+def test_a_constant_force_beside_slow_misfit_is_not_taken_for_its_drift():
+    """Of a part of the drive's record what is left is all but a random walk, in which a constant is nothing."""
+    rig = RIGS["drive"]()
+    (train,) = rig.records
+    record, _ = train.split(fraction=0.6)
+    fit = ehsvjax.identify(rig.model, record, key=jax.random.key(0), population=40, generations=10)
+    found = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
+    assert {"coulomb_friction", "constant_force"} <= {*found.names}, str(found)

@@ -5,7 +5,7 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -68,13 +68,11 @@ class Noise(NamedTuple):
     def gained(
         self, left: Float[np.ndarray, "record time signal"], more: Float[np.ndarray, "record time signal"]
     ) -> float:
-        """Return by how much one explanation's residual is less than another's, in variances of what is left.
-
-        Where noise alone is left, this is twice the logarithm of the likelihood ratio.
+        """Return twice the logarithm of the likelihood ratio of one explanation and another.
 
         Args:
-            left: measured minus simulated, by the one; in the outputs' units. What is not finite is infinitely worse.
-            more: by the other.
+            left: measured minus simulated, by the other; in the outputs' units. What is not finite is infinitely worse.
+            more: by the one.
 
         """
         squares = [float(np.nan_to_num(r @ r, nan=np.inf)) for r in map(self.scaled, (left, more))]
@@ -88,25 +86,43 @@ class Noise(NamedTuple):
         left: Float[np.ndarray, "record time signal"],
         more: Float[np.ndarray, "record time signal"],
     ) -> float:
-        """Return a difference of two explanations' scaled squares in variances of what is left along the difference.
+        """Return what a difference of two explanations' scaled squares says of them, as `gained` counts.
 
-        Along what the two do differently the better one leaves the noise, or, if it is surely more, what differs from
-        part to part of the records. Where more is left, whatever is flexible gains by it, and what it gains in one part
-        it loses in another (Wald's test with the covariance of White 1982, "Maximum likelihood estimation of
-        misspecified models", and for rivals Vuong 1989, "Likelihood ratio tests for model selection and non-nested
-        hypotheses", with parts for samples, as what is left is correlated).
+        A variance that is known of a few parts only may be larger by chance: the likelihood ratio is then Student's.
+        """
+        gain, parts = self.in_variances(squares, left, more)
+        return gain if np.isinf(parts) else float(np.copysign(parts * np.log1p(abs(gain) / parts), gain))
+
+    def in_variances(
+        self,
+        squares: float,
+        left: Float[np.ndarray, "record time signal"],
+        more: Float[np.ndarray, "record time signal"],
+    ) -> tuple[float, float]:
+        """Return a difference of two explanations' scaled squares in variances of what is left along what they differ
+        by, and of how many parts these are known.
+
+        There the better one leaves the noise, or, if it is surely more, what differs from part to part of the records.
+        Where more is left, whatever is flexible gains by it, and what it gains in one part it loses in another (Wald's
+        test with the covariance of White 1982, "Maximum likelihood estimation of misspecified models", and for rivals
+        Vuong 1989, "Likelihood ratio tests for model selection and non-nested hypotheses", with parts for samples, as
+        what is left is correlated).
         """
         both = self.scaled(left), self.scaled(more)
         change = both[0] - both[1]
         if not change.any():
-            return 0.0
-        return squares / self.left_along(change, min(both, key=lambda r: float(r @ r)))
+            return 0.0, np.inf
+        variance, parts = self.left_along(change, min(both, key=lambda r: float(r @ r)))
+        return squares / variance, parts
 
-    def left_along(self, direction: Float[np.ndarray, " sample"], left: Float[np.ndarray, " sample"]) -> float:
-        """Return the variance of what an explanation leaves, along a direction; both of scaled readings.
+    def left_along(
+        self, direction: Float[np.ndarray, " sample"], left: Float[np.ndarray, " sample"]
+    ) -> tuple[float, float]:
+        """Return the variance of what an explanation leaves, along a direction, and of how many parts it is known.
 
-        That of the noise, or, if it is more and not by chance, as it differs from part to part of the records: of a sum
-        of squares of as many independent parts as the direction lies in (Satterthwaite 1946).
+        That of the noise, which is known, or, if it is more and not by chance, as it differs from part to part of the
+        records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Both
+        arguments are of scaled readings.
         """
         from scipy.special import chdtrc
 
@@ -115,7 +131,9 @@ class Noise(NamedTuple):
         shares = np.bincount(part_of, direction**2) / squares
         parts = 1.0 / float(shares @ shares)
         between = float(np.sum(np.bincount(part_of, direction * left) ** 2)) / squares
-        return between if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT else of_noise
+        if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
+            return between, parts
+        return of_noise, np.inf
 
     def of_record(self, record: int) -> "Noise":
         """Return the noise with the readings of one record alone."""
@@ -299,16 +317,6 @@ def _alike(noise: ResidualNoise, before: ResidualNoise) -> bool:
     """Whether two estimates of a noise are the same, for all that is made of them."""
     pairs = ((noise.variance, before.variance), (noise.correlation_samples, before.correlation_samples))
     return all(abs(now - then) <= _SETTLED * abs(then) for now, then in pairs)
-
-
-def surely_gained(
-    noises: Sequence[Noise],
-    left: Float[np.ndarray, "record time signal"],
-    more: Float[np.ndarray, "record time signal"],
-) -> float:
-    """Return the least of what one explanation gains on another under several noises; nothing if they do not agree."""
-    gains = [noise.gained(left, more) for noise in noises]
-    return min(gains, key=abs) if len({gain > 0.0 for gain in gains}) == 1 else 0.0
 
 
 def _basis(responses) -> Float[np.ndarray, "record signal time direction"]:

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER
-from ehsvjax.diagnosis.bench.noise import Noise, surely_gained
-from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left, padded, refit
+from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.trials import (
@@ -110,12 +110,8 @@ def _ranked(
 
     def behind(best: int) -> dict[int, float]:
         """Return by how much each is worse than one of them, their prices included."""
-        # All that the best leaves may be chance, and what they do differently must stand out from that too.
-        every_noise = noise, noise_of_all_left(trials.bench, able[best])
         return {
-            candidate: surely_gained(every_noise, refitted.residual[0], able[best].residual[0])
-            + prices[candidate]
-            - prices[best]
+            candidate: noise.gained(refitted.residual[0], able[best].residual[0]) + prices[candidate] - prices[best]
             for candidate, refitted in able.items()
         }
 

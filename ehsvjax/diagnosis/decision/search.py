@@ -10,9 +10,9 @@ from jaxtyping import Float
 from ehsvjax.arithmetic import finest
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
-from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise, surely_gained
+from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.progress import Progress
-from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left
+from ehsvjax.diagnosis.bench.refits import Refits
 from ehsvjax.diagnosis.bench.workbench import Workbench, prepared, settled
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
@@ -67,7 +67,7 @@ class Need(NamedTuple):
     """How much worse the fit is without an effect, everything else refitted, in variances of what is left.
 
     Attributes:
-        gain: of all records; the least by noise as it is seen outside all responses, and as all that is left would be.
+        gain: of all records.
         of_record: of each in turn; negative where it would do better without.
         required: what chance would gain with it, after the search that found it.
 
@@ -312,10 +312,14 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
         penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
+        # While other causes are missing, what differs from part to part is theirs: the last look judges it (`_needs`).
         enough = [
-            stage.noise.gained(stage.current.residual[0], residual) > required_gain(bench, stage.screening, s.candidate)
-            for s, residual in zip(some, refitted.residual, strict=True)
-        ]
+            np.isfinite(cost)
+            and stage.noise.in_variances(
+                float(stage.current.cost[0] - cost), stage.current.residual[0], residual
+            )[0] > required_gain(bench, stage.screening, s.candidate)
+            for s, cost, residual in zip(some, refitted.cost, refitted.residual, strict=True)
+        ]  # fmt: skip
         if not any(enough):
             continue
         chosen = int(np.argmin(np.where(enough & np.isfinite(penalised), penalised, np.inf)))
@@ -346,8 +350,6 @@ def _cost_under(refits: Refits, noise: Noise) -> float:
 def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
     """Return what the fit needs each effect for, and what is left of unused data; see `Selection.unused`."""
     trials, final, noise = stage.trials, stage.current, stage.noise
-    # All that is left may be chance as well: what a cause explains must stand out from that too.
-    every_noise = noise, noise_of_all_left(trials.bench, final)
     sets, refits, needs = [stage.included], [final], []
     for i in stage.included:
         rest = tuple(j for j in stage.included if j != i)
@@ -355,7 +357,7 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         refits.append(refit_set(trials, final.points[0] if rest else nominal.points[0], rest, noise))
         both = refits[-1].residual[0], final.residual[0]
         needs.append(Need(
-            gain=surely_gained(every_noise, *both),
+            gain=noise.gained(*both),
             of_record=tuple(noise.of_record(k).gained(*both) for k in range(len(trials.bench.records))),
             required=required_gain(trials.bench, stage.screening, i),
         ))  # fmt: skip

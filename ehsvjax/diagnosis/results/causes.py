@@ -144,7 +144,7 @@ def _standard_errors(selection: Selection) -> dict[int, float]:
     found = {}
     for column, influence in zip(columns.tolist(), _influences(jacobian), strict=True):
         if influence.any():
-            variance = float(influence @ influence) * noise.left_along(influence, left)
+            variance = float(influence @ influence) * noise.left_along(influence, left)[0]
             found[column] = float(np.sqrt(variance)) * float(selection.bench.problem.coordinates.upper[column])
     return found
 
