@@ -12,7 +12,7 @@ from ehsvjax import Model, Parameter, Signal, runge_kutta_4
 MASS, DAMPING, STIFFNESS = 2.0, 3.0, 40.0
 
 
-def carriage(stiffness=STIFFNESS, mass=MASS, max_step=0.005) -> Model:
+def carriage(stiffness=STIFFNESS, mass=MASS, max_step=0.02) -> Model:
     """Return the model: its damping is identified, its mass certain, its stiffness given; b is given as zero."""
     return Model(
         name="carriage",
