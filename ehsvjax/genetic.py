@@ -168,7 +168,7 @@ def generation(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("operators", "generations"))
+@functools.partial(jax.jit, static_argnames=("operators",))
 def run(
     cost: Callable,
     operators: Operators,
@@ -176,7 +176,7 @@ def run(
     history: History,
     until: int | Int[Array, ""],
     tolerance: float | Float[Array, ""],
-    generations: int | None = None,
+    generations: int | Int[Array, ""] | None = None,
 ) -> tuple[State, History]:
     """Run up to generation `until`, or until the stop test is passed: one compiled call, simulation included.
 
@@ -190,7 +190,7 @@ def run(
         history: likewise; of a shorter one than the run the last generations stay.
         until: the generation to stop at, at most the number of generations.
         tolerance: of the stop test, see `generation`.
-        generations: how many there will be at most, static; by default the history's length.
+        generations: how many there will be at most; by default the history's length.
 
     """
     length = len(history.best_cost)

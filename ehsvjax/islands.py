@@ -33,7 +33,7 @@ def init(
     return states, jax.tree.map(lambda leaf: leaf[0], histories)
 
 
-@functools.partial(jax.jit, static_argnames=("operators", "generations", "devices"))
+@functools.partial(jax.jit, static_argnames=("operators", "devices"))
 def run(
     cost: Callable,
     operators: Operators,
@@ -41,7 +41,7 @@ def run(
     history: History,
     until: int | Int[Array, ""],
     tolerance: float | Float[Array, ""],
-    generations: int | None = None,
+    generations: int | Int[Array, ""] | None = None,
     *,
     devices: tuple[jax.Device, ...],
 ) -> tuple[State, History]:
@@ -63,12 +63,12 @@ def run(
     most = len(history.best_cost) if generations is None else generations
     mesh, shared, alike = Mesh(np.array(devices), ("island",)), PartitionSpec("island"), PartitionSpec()
     state, history = jax.shard_map(
-        functools.partial(_run_here, operators, most, len(devices)),
+        functools.partial(_run_here, operators, len(devices)),
         mesh=mesh,
-        in_specs=(alike, shared, alike, alike, alike),
+        in_specs=(alike, shared, alike, alike, alike, alike),
         out_specs=(shared, alike),
         check_vma=False,
-    )(cost, state, history, jnp.asarray(until), jnp.asarray(tolerance))
+    )(cost, state, history, jnp.asarray(until), jnp.asarray(tolerance), jnp.asarray(most))
     # Every process can then look at every island.
     return lax.with_sharding_constraint(state, NamedSharding(mesh, alike)), history
 
@@ -93,7 +93,7 @@ def merged(state: State, elites: int) -> State:
 
 
 def _run_here(
-    operators: Operators, generations: int, device_count: int, cost, state: State, history: History, until, tolerance
+    operators: Operators, device_count: int, cost, state: State, history: History, until, tolerance, generations
 ):
     """Run the islands of one device; every device takes part in every generation."""
 

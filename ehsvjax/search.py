@@ -24,7 +24,8 @@ from ehsvjax.sealed import read_sealed, write_sealed
 
 # Of one compiled call, s: an interrupt is heard between two.
 _PATIENCE = 0.5
-# Generations whose history is on the device: longer runs bring it home piece by piece.
+# Generations whose history is on the device, so that one program serves runs of any length; longer ones bring it home
+# piece by piece.
 _REMEMBERED = 1024
 # What a generation holds of each individual at least: coordinates of candidates, population, parents and children.
 _COPIES = 5
@@ -66,13 +67,12 @@ def search(
     """
     check_sizes(population, generations, operators, islands, unknowns)
     key = jax.random.wrap_key_data(key) if jnp.issubdtype(key.dtype, jnp.unsignedinteger) else key
-    remembered = min(generations, _REMEMBERED)
     if islands == 1:
         run: Callable = genetic.run
-        state, recent = genetic.init(key, population, unknowns, remembered, operators.elites)
+        state, recent = genetic.init(key, population, unknowns, _REMEMBERED, operators.elites)
     else:
         run = functools.partial(archipelago.run, devices=tuple(devices or jax.devices()[:1]))
-        state, recent = archipelago.init(key, islands, population, unknowns, remembered, operators.elites)
+        state, recent = archipelago.init(key, islands, population, unknowns, _REMEMBERED, operators.elites)
     state, history = _run(run, cost, operators, state, recent, generations, tolerance, progress, checkpoint)
     return (state if islands == 1 else archipelago.merged(state, operators.elites)), history
 
