@@ -101,6 +101,7 @@ def of_fits() -> Iterator[Call]:
         "model": (model, THING), "records": (record, THING), "key": (jax.random.key(0), KEY),
         "population": (4, WHOLE), "generations": (1, WHOLE), "bounds": ({"gain": (1.0, 3.0)}, bounds_of("gain")),
         "fixed": ({"lag": 1.0}, values_of("lag")), "initial": ("estimate", initial), "refine": (False, FLAG),
+        "start": ({"gain": 2.0}, values_of("gain") | {"outside": {"gain": 99.0}}),
         "noise_variance": ({"level": 1e-4}, variances), "huber": (1.5, without(POSITIVE, "None")),
         "operators": (ehsvjax.Operators(), THING), "tolerance": (0.01, NOT_NEGATIVE), "starts": (1, WHOLE),
         "islands": (1, WHOLE), "devices": (None, without(THING, "None")), "progress": (False, FLAG),

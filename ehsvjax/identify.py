@@ -29,6 +29,7 @@ from ehsvjax.solve import (
     best_of,
     candidates,
     compile_refinement,
+    guessed,
     initial_by_record,
     nominal_initial,
     refine_and_reweigh,
@@ -51,6 +52,7 @@ def identify(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     fixed: Mapping[str, float] | None = None,
     initial: Initial = "estimate",
+    start: Mapping[str, float] | None = None,
     refine: bool = True,
     noise_variance: Mapping[str, float] | None = None,
     huber: float | None = None,
@@ -79,6 +81,8 @@ def identify(
         fixed: name -> value, SI, for parameters that are not to be identified.
         initial: "estimate" the initial conditions of each record, take the model's "nominal" ones, or give those that
             are known by name (the others are estimated), one mapping for all records or one for each.
+        start: name -> value, SI, of a guess that joins the first population; parameters that it does not name are
+            nominal.
         refine: whether the gradient refinement follows the search.
         noise_variance: name of the output -> variance, unit squared, where it is known.
         huber: residuals beyond this many standard deviations weigh linearly (1.345 is usual), for records with spikes.
@@ -111,6 +115,7 @@ def identify(
     check_sizes(population, generations, operators, islands, problem.unknowns)
     whole("starts", starts, 1, population * islands, "at most as many as there are individuals")
     begin = replace(problem, coordinates=where_to_search(model, records, problem))
+    first = None if start is None else guessed(begin, model, start)
     slow = doubts.about_steps(model, records)
     for doubt in slow:
         warnings.warn(doubt, RuntimeWarning, stacklevel=2)
@@ -125,6 +130,7 @@ def identify(
         generations=generations,
         operators=operators,
         tolerance=tolerance,
+        first=first,
         islands=islands,
         devices=devices,
         progress=progress,

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.multihost_utils import process_allgather
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from ehsvjax import genetic
 from ehsvjax import islands as archipelago
@@ -40,6 +40,7 @@ def search(
     generations: int,
     operators: Operators,
     tolerance: float,
+    first: Float[np.ndarray, " parameter"] | None = None,
     islands: int = 1,
     devices: Sequence[jax.Device] | None = None,
     progress: bool = False,
@@ -55,6 +56,7 @@ def search(
         generations: at most this many.
         operators: the operators.
         tolerance: of the stop test; 0 runs all generations.
+        first: in the unit cube, an individual of the first population, of every island.
         islands: populations that evolve apart and exchange their best, each of `population` individuals.
         devices: those that share several islands; by default the first alone.
         progress: show a bar.
@@ -73,6 +75,8 @@ def search(
     else:
         run = functools.partial(archipelago.run, devices=tuple(devices or jax.devices()[:1]))
         state, recent = archipelago.init(key, islands, population, unknowns, _REMEMBERED, operators.elites)
+    if first is not None:
+        state = state._replace(candidates=state.candidates.at[..., 0, :].set(jnp.asarray(first, jnp.float32)))
     state, history = _run(run, cost, operators, state, recent, generations, tolerance, progress, checkpoint)
     return (state if islands == 1 else archipelago.merged(state, operators.elites)), history
 

@@ -2,7 +2,7 @@
 
 import threading
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 
 from ehsvjax import genetic
 from ehsvjax.arithmetic import ROUGHLY, settled_at
+from ehsvjax.checks import by_name, number
 from ehsvjax.doubts import NO_CHANGE, residuals_at
 from ehsvjax.fit import Effort
 from ehsvjax.models.model import Model
@@ -40,6 +41,29 @@ class Best(NamedTuple):
     residual_variance: Float[np.ndarray, " signal"]
     idle: Bool[np.ndarray, " parameter"]
     effort: Effort
+
+
+def guessed(problem: Problem, model: Model, start: Any) -> Float[np.ndarray, " parameter"]:
+    """Return the individual of a guess, name -> value, SI; what it does not name is nominal.
+
+    Raises:
+        ValueError: for what is no such mapping, a name that is no unknown parameter, or a value beyond its bounds.
+
+    """
+    values = {name: model.parameter(name).value for name in problem.free}
+    for name, value in by_name("start", start, "{'flow_gain': 1e-4}").items():
+        if name not in values:
+            known = ", ".join(values) or "none"
+            raise ValueError(f"expected start to name parameters that are to be identified, {known}; got {name!r}")
+        p = model.parameter(name)
+        values[name] = number(f"start of {name}", value, remedy=f"give its value, {p.unit or 'without a unit'}")
+        if not p.lower <= values[name] <= p.upper:
+            raise ValueError(f"expected start of {name} within its bounds, {p.lower:g} to {p.upper:g}, got {value}")
+    individual = np.full(problem.unknowns, 0.5)
+    count = len(values)
+    own = problem.coordinates._replace(**{n: c[:count] for n, c in problem.coordinates._asdict().items()})
+    individual[:count] = np.clip(to_unit(own, np.array(list(values.values()))), 0.0, 1.0)
+    return with_nominal_initial(problem, model, individual) if problem.free_initial else individual
 
 
 def compile_refinement(problem: Problem, starts: int) -> threading.Thread:

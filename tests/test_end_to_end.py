@@ -161,6 +161,31 @@ def test_configuration_of_the_user_is_left_alone(record):
     assert not jax.config.jax_enable_x64
 
 
+@pytest.mark.parametrize("islands", [1, 2])
+def test_a_guess_joins_the_first_population(record, islands):
+    """Of one generation of a few individuals the truth is the best; what is not named is nominal."""
+    small = {"population": 8, "generations": 1, "starts": 1, "refine": False, "islands": islands}
+    known = {"initial": {"initial_position": 0.3, "initial_velocity": -0.2}}
+    found = _identified(record, start=TRUTH, **small, **known)
+    assert found.parameters == pytest.approx(TRUTH, rel=1e-6)
+    # Its initial conditions are in the middle of what the first readings show, and nominal.
+    assert _identified(record, start=TRUTH, **small).parameters == pytest.approx(TRUTH, rel=1e-6)
+    assert _identified(record, start={"gamma": 1.23}, **small, **known).parameters == pytest.approx(TRUTH, rel=1e-6)
+
+
+def test_a_guess_that_cannot_be_is_refused(record):
+    for start, message in (
+        ({"alfa": 1.0}, "alfa"),
+        ({"initial_position": 0.0}, "to be identified, alpha, gamma"),
+        ({"alpha": 3.0}, "within its bounds, 0.48 to 1.44"),
+        ({"alpha": float("nan")}, "start of alpha"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            _identified(record, start=start)
+    with pytest.raises(ValueError, match="alpha"):
+        _identified(record, start={"alpha": 0.9}, fixed={"alpha": 0.96})
+
+
 def test_known_initial_conditions_and_fixed_parameters(record):
     known = {"initial_position": 0.3, "initial_velocity": -0.2}
     fit = _identified(record, initial=known, fixed={"alpha": 0.96})

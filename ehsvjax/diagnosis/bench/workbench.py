@@ -224,7 +224,9 @@ class Workbench:
         columns: Int[np.ndarray, " direction"] | Sequence[int],
     ) -> Float[np.ndarray, "direction record time signal"]:
         """Return derivatives, from the outputs at points and at those moved by `differences` along columns."""
-        change = changed - outputs
+        # Where neither can be simulated there is none either: NaN, without a warning.
+        with np.errstate(invalid="ignore"):
+            change = changed - outputs
         # What a dead zone hides has no derivative; rounding must not give it one.
         largest = np.max(np.abs(outputs), axis=(1, 2, 3))
         change[np.max(np.abs(change), axis=(1, 2, 3)) < ROUNDING * largest] = 0.0
