@@ -81,6 +81,29 @@ def search(
     return (state if islands == 1 else archipelago.merged(state, operators.elites)), history
 
 
+def costs_of(
+    cost: Callable, individuals: Float[np.ndarray, "individual parameter"], population: int, operators: Operators
+) -> Float[np.ndarray, " individual"]:
+    """Return the costs of any number of individuals, by the program that `search` runs: it is compiled once for both.
+
+    Each population of them is taken for a first generation, of which nothing else is kept; the last is filled up.
+
+    Args:
+        cost, population, operators: as for `search`, on one island.
+        individuals: in the unit cube.
+
+    """
+    filled = np.concatenate([individuals, np.repeat(individuals[-1:], -len(individuals) % population, axis=0)])
+    state, recent = genetic.init(
+        jax.random.key(0), population, individuals.shape[1], _REMEMBERED, operators.elites
+    )  # fmt: skip
+    found = [
+        genetic.run(cost, operators, state._replace(candidates=part), recent, 1, 0.0, 1)[0].cost
+        for part in np.split(filled.astype(np.float32), len(filled) // population)
+    ]
+    return np.concatenate(found)[: len(individuals)]
+
+
 def _run(
     run: Callable,
     cost: Callable,

@@ -19,6 +19,7 @@ from jax.tree_util import Partial
 import ehsvjax
 from ehsvjax import checks, search
 from ehsvjax.genetic import Operators
+from tests.compilations import compilations
 
 ROOT = Path(__file__).parents[1]
 CENTRE = jnp.array([0.3, 0.7])
@@ -93,6 +94,33 @@ def test_a_long_run_is_the_same_in_pieces_of_any_length(monkeypatch, tmp_path):
     _assert_same(_searched(generations=40, checkpoint=tmp_path / "run"), whole)
     assert len(whole[1].best_cost) == 40
     assert np.isfinite(whole[1].best_cost).all()
+
+
+def _failing_beyond_the_middle(centre, individuals):
+    return jnp.where(individuals[:, 0] > 0.5, jnp.nan, _sphere(centre, individuals))
+
+
+@pytest.mark.parametrize("count", [1, 8, 21])
+def test_costs_of_any_number_of_individuals_are_those_of_each(count):
+    individuals = np.random.default_rng(2).uniform(size=(count, 2))
+    found = search.costs_of(Partial(_failing_beyond_the_middle, CENTRE), individuals, 8, Operators(elites=2))
+    expected = np.sum((individuals - np.array([0.3, 0.7])) ** 2, axis=1)
+    np.testing.assert_allclose(found, np.where(individuals[:, 0] > 0.5, np.inf, expected), rtol=1e-5)
+
+
+def test_runs_of_any_number_of_generations_and_costs_share_one_program():
+    def searched(generations):
+        search.search(
+            cost, jax.random.key(1), unknowns=2, population=12, generations=generations, operators=Operators(),
+            tolerance=0.0,
+        )  # fmt: skip
+
+    cost = Partial(_sphere, CENTRE)
+    with compilations() as compiled:
+        search.costs_of(cost, np.full((3, 2), 0.2), 12, Operators())
+        searched(3)
+        searched(7)
+    assert compiled.count("jit(run)") == 1
 
 
 def test_islands_remember_their_history_piece_by_piece(monkeypatch):

@@ -26,9 +26,9 @@ from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators
 from ehsvjax.population import cast
 from ehsvjax.record import Record
-from ehsvjax.search import search
+from ehsvjax.search import costs_of, search
 
-_POPULATION = 32
+_POPULATION, _OPERATORS = 32, Operators()
 # Of the limits' range that the simulation of every explanation stays away from them.
 _MARGIN = 0.05
 # Separation of a pair, noise variances, that is worth half of the most that it can be worth.
@@ -98,19 +98,17 @@ def options_of(question: Question, measured: Sequence[str], count: int, key) -> 
     space = told.space
     single = _cast(told, jnp.float32)
     simple = plain(space, usual, count)
-    with ThreadPoolExecutor() as pool:  # most of it is compiling, on a core each
-        searching = pool.submit(
-            search,
-            jax.tree_util.Partial(_cost, single),
-            key,
-            unknowns=count * space.genes,
-            population=_POPULATION,
-            generations=question.generations,
-            operators=Operators(),
-            tolerance=0.0,
-        )
-        costs = _costs(single, simple)
-        state, _ = searching.result()
+    cost = jax.tree_util.Partial(_cost, single)
+    costs = costs_of(cost, simple, _POPULATION, _OPERATORS)
+    state, _ = search(
+        cost,
+        key,
+        unknowns=count * space.genes,
+        population=_POPULATION,
+        generations=question.generations,
+        operators=_OPERATORS,
+        tolerance=0.0,
+    )
     chosen = [(np.asarray(state.elites[0], float), False)] if state.elite_cost[0] < _BROKEN else []
     chosen += [(simple[i], True) for i in _worth_a_refit(space, simple, costs)]
     options = []
@@ -194,16 +192,6 @@ def _cost(question: Separable, individuals: Float[Array, "experiment gene"]) -> 
     still = sum(jnp.any(jnp.ptp(one.outputs, axis=1) == 0.0, axis=1) for one in every)
     cost = jnp.where((worst > 0.0) | (still > 0), _BROKEN + worst + still, -told / jnp.sum(question.apart))
     return jnp.where(jnp.isfinite(told), cost, jnp.inf)
-
-
-_judged = jax.jit(_cost)
-
-
-def _costs(question: Separable, genes: Float[np.ndarray, "experiment gene"]) -> Float[np.ndarray, " experiment"]:
-    """Return the costs of any number of experiments, in populations of one size, the last filled up."""
-    filled = np.concatenate([genes, np.repeat(genes[-1:], -len(genes) % _POPULATION, axis=0)]).astype(np.float32)
-    parts = np.split(filled, len(filled) // _POPULATION)
-    return np.concatenate([np.asarray(_judged(question, jnp.asarray(part))) for part in parts])[: len(genes)]
 
 
 def _worth_a_refit(space: Space, genes, costs) -> list[int]:
