@@ -17,6 +17,7 @@ from ehsvjax.score import Score, differences, score_of
 from ehsvjax.simulate import simulate
 
 if TYPE_CHECKING:
+    import pandas
     from jaxtyping import Array, Key
 
     from ehsvjax.effects import Effect
@@ -343,6 +344,27 @@ class Fit:
     @functools.cached_property
     def _prepared_by_noise(self) -> dict[str, "Prepared"]:
         return {}
+
+    @property
+    def table(self) -> "pandas.DataFrame":
+        """All parameters with symbols, values, standard errors, units and bounds, SI, for reports: `.to_latex()`."""
+        from ehsvjax.tables import parameter_table
+
+        return parameter_table(self)
+
+    def to_dataframe(
+        self, record: Record | None = None, initial: Mapping[str, float] | str = "estimate"
+    ) -> "pandas.DataFrame":
+        """Return `time` (s), the inputs, and each output as measured, as simulated, and what is left of it, SI.
+
+        Args:
+            record: by default the first that was fitted.
+            initial: as for `simulate`.
+
+        """
+        from ehsvjax.tables import simulation_table
+
+        return simulation_table(self, self.records[0] if record is None else record, initial)
 
     def plot(self, record: Record | None = None):
         """Draw measured against simulated, the residual, and the cost by generation; returns the matplotlib figure.
