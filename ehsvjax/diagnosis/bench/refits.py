@@ -11,7 +11,8 @@ from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
 _ITERATIONS = 60
-# A start is given up if so many steps like the next would not bring it to the best, after a few.
+# A start is given up if so many undamped steps would not bring it to the best, after a few: behind a kink the next
+# ones are short for a while.
 _HOPELESS = 5.0
 _PATIENCE = 4
 _STEEPEST = 1e100
@@ -128,6 +129,14 @@ def refit(
         own = chosen[k][chosen[k] >= 0]
         points[k, own] = np.clip(points[k, own], lower[own], upper[own])
     trial = points.copy()
+
+    def hopeless(i):
+        """Whether not even several steps without damping would bring it to the best."""
+        here = kept[i]
+        assert here is not None
+        _, most = _step(points[i], chosen[i], here.gradient, here.information, 0.0, lower, upper)
+        return _HOPELESS * most < cost[i] - np.min(cost)
+
     for iteration in range(iterations):
         at = np.flatnonzero(running)
         if not len(at):
@@ -156,7 +165,7 @@ def refit(
             if gain < 0.01 * variance:
                 converged[i] = True
                 running[i] = False
-            elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and _HOPELESS * gain < cost[i] - np.min(cost)):
+            elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and hopeless(i)):
                 running[i] = False
             trial[i] = points[i] + step
         # Near the minimum no valley is left to follow.
