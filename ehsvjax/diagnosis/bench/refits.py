@@ -11,8 +11,8 @@ from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.effects.effect import UNLIMITED
 
 _ITERATIONS = 60
-# A start is given up if so many undamped steps would not bring it to the best, after a few: behind a kink the next
-# ones are short for a while.
+# A start is given up if so many steps like the next would not bring it to the best, so many times in a row: a kink
+# makes some of them short, until damping has grown and shrunk again.
 _HOPELESS = 5.0
 _PATIENCE = 4
 _STEEPEST = 1e100
@@ -123,21 +123,13 @@ def refit(
     kept: list[_Here | None] = [None] * count
     damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
     cost = np.full(count, np.inf)
-    converged = np.zeros(count, bool)
+    converged, hopeless = np.zeros(count, bool), np.zeros(count, int)
     running, bending = np.ones(count, bool), np.ones(count, bool)
     for k in range(count):
         own = chosen[k][chosen[k] >= 0]
         points[k, own] = np.clip(points[k, own], lower[own], upper[own])
     trial = points.copy()
-
-    def hopeless(i):
-        """Whether not even several steps without damping would bring it to the best."""
-        here = kept[i]
-        assert here is not None
-        _, most = _step(points[i], chosen[i], here.gradient, here.information, 0.0, lower, upper)
-        return _HOPELESS * most < cost[i] - np.min(cost)
-
-    for iteration in range(iterations):
+    for _ in range(iterations):
         at = np.flatnonzero(running)
         if not len(at):
             break
@@ -165,7 +157,8 @@ def refit(
             if gain < 0.01 * variance:
                 converged[i] = True
                 running[i] = False
-            elif damping[i] > 1e12 or (race and iteration >= _PATIENCE and hopeless(i)):
+            hopeless[i] = hopeless[i] + 1 if _HOPELESS * gain < cost[i] - np.min(cost) else 0
+            if damping[i] > 1e12 or (race and hopeless[i] >= _PATIENCE):
                 running[i] = False
             trial[i] = points[i] + step
         # Near the minimum no valley is left to follow.
