@@ -94,9 +94,7 @@ def costs_of(
 
     """
     filled = np.concatenate([individuals, np.repeat(individuals[-1:], -len(individuals) % population, axis=0)])
-    state, recent = genetic.init(
-        jax.random.key(0), population, individuals.shape[1], _REMEMBERED, operators.elites
-    )  # fmt: skip
+    state, recent = genetic.init(jax.random.key(0), population, individuals.shape[1], _REMEMBERED, operators.elites)
     found = [
         genetic.run(cost, operators, state._replace(candidates=part), recent, 1, 0.0, 1)[0].cost
         for part in np.split(filled.astype(np.float32), len(filled) // population)

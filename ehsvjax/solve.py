@@ -50,20 +50,18 @@ def guessed(problem: Problem, model: Model, start: Any) -> Float[np.ndarray, " p
         ValueError: for what is no such mapping, a name that is no unknown parameter, or a value beyond its bounds.
 
     """
-    values = {name: model.parameter(name).value for name in problem.free}
+    named = {name: model.parameter(name).value for name in problem.free}
     for name, value in by_name("start", start, "{'flow_gain': 1e-4}").items():
-        if name not in values:
-            known = ", ".join(values) or "none"
+        if name not in named:
+            known = ", ".join(named) or "none"
             raise ValueError(f"expected start to name parameters that are to be identified, {known}; got {name!r}")
         p = model.parameter(name)
-        values[name] = number(f"start of {name}", value, remedy=f"give its value, {p.unit or 'without a unit'}")
-        if not p.lower <= values[name] <= p.upper:
+        named[name] = number(f"start of {name}", value, remedy=f"give its value, {p.unit or 'without a unit'}")
+        if not p.lower <= named[name] <= p.upper:
             raise ValueError(f"expected start of {name} within its bounds, {p.lower:g} to {p.upper:g}, got {value}")
-    individual = np.full(problem.unknowns, 0.5)
-    count = len(values)
-    own = problem.coordinates._replace(**{n: c[:count] for n, c in problem.coordinates._asdict().items()})
-    individual[:count] = np.clip(to_unit(own, np.array(list(values.values()))), 0.0, 1.0)
-    return with_nominal_initial(problem, model, individual) if problem.free_initial else individual
+    values = values_of(problem, np.full(problem.unknowns, 0.5))
+    values[: len(named)] = list(named.values())
+    return with_nominal_initial(problem, model, np.clip(to_unit(problem.coordinates, values), 0.0, 1.0))
 
 
 def compile_refinement(problem: Problem, starts: int) -> threading.Thread:

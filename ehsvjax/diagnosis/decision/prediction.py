@@ -33,7 +33,7 @@ class Predicted(NamedTuple):
     squares: Float[np.ndarray, "set part"]
 
     def against(self, k: int, j: int, parts: slice = slice(None)) -> float:
-        """Return by how much unused data speak against one set and for another, in variances of what is left.
+        """Return by how much unused data speak against one set and for another, as `Noise.gained` counts.
 
         The likelihood of all readings is that of those that were used times that of the others, given those: what the
         others tell is what a refit to all gains, less what it gains on those that were used (Dawid 1984, "The

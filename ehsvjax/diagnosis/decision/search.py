@@ -64,7 +64,7 @@ class Integration(NamedTuple):
 
 
 class Need(NamedTuple):
-    """How much worse the fit is without an effect, everything else refitted, in variances of what is left.
+    """How much worse the fit is without an effect, everything else refitted, as `Noise.gained` counts.
 
     Attributes:
         gain: of all records.
