@@ -282,6 +282,11 @@ def of_simulation() -> Iterator[Call]:
         "model": (model, THING), "record": (record, THING), **values, "initial": ({"start": 0.0}, values_of("start")),
         "substeps": (2, without(WHOLE, "None")), "signal": (lambda name, value, **context: value, FUNCTION),
     })  # fmt: skip
+    signals = {"text": "flow", "number": 3.0, "numbers": [1.0], "unknown": ["nobody"], "empty": [], "object": object()}
+    yield from damaged("linearise", ehsvjax.linearise, {
+        "model": (model, THING), "at": ({"command": 0.5}, values_of("command")), **values,
+        "initial": ({"start": 0.0}, values_of("start")), "inputs": (["command"], signals), "outputs": (["flow"], signals),
+    })  # fmt: skip
     variances = without(values_of("level"), "None") | {
         "None": None,
         "zero": {"level": 0.0},

@@ -131,6 +131,8 @@ def of_fits() -> Iterator[Call]:
     noise, level = {"noise": ("white", CHOICE)}, {"level": (0.95, SHARE | {"zero": 0.0, "one": 1.0})}
     yield from damaged("Fit.precision", fit.precision, noise)
     yield from damaged("Precision.intervals", fit.precision().intervals, level)
+    at = {"at": ({"command": 0.5}, values_of("command")), "initial": ({"start": 0.0}, values_of("start"))}
+    yield from damaged("Fit.linearise", fit.linearise, at | noise)
     names = {"text": "gain", "number": 3.0, "numbers": [1.0], "unknown": ["nobody"], "empty": [], "object": object()}
     yield from damaged("Fit.profile_likelihood", fit.profile_likelihood, {"names": (["gain"], names), **level, **noise})
     yield from damaged("Fit.bootstrap", fit.bootstrap, {

@@ -25,6 +25,7 @@ from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators
 from ehsvjax.identify import identify
 from ehsvjax.integrators import runge_kutta_4
+from ehsvjax.linear import linearise
 from ehsvjax.models import Model, Parameter, Signal, servovalve, van_der_pol
 from ehsvjax.precision import cramer_rao_bound, design
 from ehsvjax.record import Record
@@ -48,6 +49,7 @@ __all__ = [
     "excitation",
     "hydraulics",
     "identify",
+    "linearise",
     "next_experiment",
     "operators",
     "runge_kutta_4",

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from jaxtyping import Array, Key
 
     from ehsvjax.effects import Effect
+    from ehsvjax.linear import LinearModel
     from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
     from ehsvjax.precision.of_fit import Prepared
 
@@ -332,6 +333,32 @@ class Fit:
         from ehsvjax.precision import of_fit
 
         return of_fit.bands(self, self._prepared(noise), self.records[0] if record is None else record, initial, level)
+
+    def linearise(
+        self,
+        at: Mapping[str, float] | None = None,
+        *,
+        initial: Mapping[str, float] | None = None,
+        inputs: Sequence[str] | None = None,
+        outputs: Sequence[str] | None = None,
+        noise: str = "auto",
+    ) -> "LinearModel":
+        """Return the linear model of small deviations about where the fitted model rests: state space, poles, Bode.
+
+        Args:
+            at: the inputs, held constant, by name; those that are not given are zero.
+            initial: initial conditions from which it comes to rest, where they differ from the nominal ones, SI.
+            inputs: what acts: inputs of the model, or any of its signals; by default the inputs.
+            outputs: what is seen: outputs of the model, or any of its signals; by default the outputs.
+            noise: as for `precision`; the errors of the parameters make the band of `.plot_bode()`.
+
+        Raises:
+            ValueError: as `ehsvjax.linearise` does, and for another noise.
+
+        """
+        from ehsvjax.precision import of_fit
+
+        return of_fit.linear(self, self._prepared(noise), at, initial, inputs, outputs)
 
     def _prepared(self, noise: str) -> "Prepared":
         from ehsvjax.precision import of_fit

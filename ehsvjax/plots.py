@@ -3,6 +3,7 @@
 import base64
 import functools
 import io
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from ehsvjax.correlations import Correlation, with_input, with_itself
 from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
+from ehsvjax.linear import LinearModel
 from ehsvjax.models.model import Model
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.record import Record, checked_record
@@ -159,6 +161,43 @@ def plot_comparison(fits: Mapping[str, Fit], records: Sequence[Record]) -> "matp
                           label=_plain(f"{name}: {percent}"))  # fmt: skip
             axes.set(title=_plain(record.name), ylabel=f"{_words(output)}\n{label}", xlabel="time (s)")
             axes.legend(loc="best")
+        figure.align_ylabels()
+    return figure
+
+
+def plot_bode(linear: LinearModel) -> "matplotlib.figure.Figure":
+    """Draw size and phase of a linear model's responses over frequency: a column for each input, two rows an output.
+
+    The band holds the true response with 95%, as far as the errors of a fit's parameters go.
+    """
+    rates = np.abs(linear.poles[np.abs(linear.poles) > 0.0])
+    least, most = (rates.min(), rates.max()) if len(rates) else (1.0, 1.0)
+    frequency = np.geomspace(0.05 * least, 10.0 * min(most, 1e3 * least), 400)
+    response, reach = linear.response(frequency), quantile_of(0.95) * linear.deviation(frequency)
+    answers = np.any(response != 0.0, axis=0)
+    decibel = 20.0 * np.log10(np.where(answers, np.abs(response), np.nan))
+    phase = np.where(answers, np.unwrap(np.angle(response), axis=0), np.nan)
+    with _style():
+        figure = _figure(width=1.0 + 4.5 * len(linear.inputs), height=0.4 + 3.8 * len(linear.outputs))
+        shape = (2 * len(linear.outputs), len(linear.inputs))
+        rows = figure.subplots(*shape, squeeze=False, sharex=True, height_ratios=[1.6, 1.0] * len(linear.outputs))
+        for (i, output), (k, name) in itertools.product(enumerate(linear.outputs), enumerate(linear.inputs)):
+            size, angle = rows[2 * i : 2 * i + 2, k]
+            for axes, curve, half in (
+                (size, decibel[:, i, k], 20.0 / math.log(10.0) * reach.real[:, i, k]),
+                (angle, np.degrees(phase[:, i, k]), np.degrees(reach.imag[:, i, k])),
+            ):
+                axes.fill_between(frequency / math.tau, curve - half, curve + half, color=_MODEL, alpha=0.25, lw=0)
+                axes.semilogx(frequency / math.tau, curve, color=_MODEL)
+                # What hardly changes is drawn as such.
+                low, high = axes.get_ylim()
+                axes.set_ylim(min(low, 0.5 * (low + high) - 5.0), max(high, 0.5 * (low + high) + 5.0))
+            silent = "" if answers[i, k] else ": does not answer"
+            size.set(title=f"{_words(name)} to {_words(output)}{silent}", ylabel="size (dB)" if k == 0 else "")
+            angle.set(ylabel="phase (°)" if k == 0 else "")
+            angle.locator_params(axis="y", nbins=5, steps=[1, 1.5, 3, 4.5, 9, 10])
+        for axes in rows[-1]:
+            axes.set_xlabel("frequency (Hz)")
         figure.align_ylabels()
     return figure
 

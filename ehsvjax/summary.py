@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ehsvjax.fit import EXPLAINS_NOTHING, Effort, Fit
+from ehsvjax.linear import LinearModel
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.precision.directions import Direction
 from ehsvjax.precision.standard_errors import Precision
@@ -49,6 +50,25 @@ def precision_summary(precision: Precision) -> str:
     sections = [_Section("Parameters", rows, ("name", "value", "standard error", "unit"))]
     sections += _precision_sections(precision)
     return "\n".join(line for section in sections for line in _text_lines(section))
+
+
+def linear_summary(linear: LinearModel) -> str:
+    """Return a linear model's operating point, poles, and what a lasting deviation comes to, as text, SI units."""
+    poles = [
+        (f"{pole.real:.6g}" + (f" +/- {pole.imag:.6g}j" if pole.imag else ""), f"{abs(pole):.6g}",
+         f"{abs(pole) / (2 * math.pi):.4g}", f"{-pole.real / abs(pole):.3g}" if pole else "")
+        for pole in linear.poles if pole.imag >= 0.0
+    ]  # fmt: skip
+    gains = [
+        (output, *(f"{gain:.6g}" if np.isfinite(gain) else "does not settle" for gain in row))
+        for output, row in zip(linear.outputs, linear.lasting, strict=True)
+    ]
+    sections = [
+        _Section("Operating point", [(name, f"{value:.6g}") for name, value in linear.point.items()]),
+        _Section("Poles", poles, ("pole, rad/s", "rad/s", "Hz", "damping ratio")),
+        _Section("Change of each output by a lasting unit of", gains, ("", *linear.inputs)),
+    ]
+    return "\n".join(line for section in sections if section.rows for line in _text_lines(section))
 
 
 class _Section(NamedTuple):

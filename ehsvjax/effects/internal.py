@@ -28,12 +28,12 @@ def internal_signals(
 ) -> Internal:
     """Return what runs along the signals at the samples of a record, arguments as for `simulate`."""
     grid = grid_of(model, record)
-    watched = _watched(model.equations, record.sample_period / grid.substeps)
-    names = _names_of(model, watched)
+    reporting = watched(model.equations, record.sample_period / grid.substeps)
+    names = _names_of(model, reporting)
     seen = simulate(
         replace(
             model,
-            measure=watched.measure,
+            measure=reporting.measure,
             signals=(*model.signals, *(model.signals[0]._replace(name=n, kind="sensor") for n in names)),
         ),
         record,
@@ -78,13 +78,14 @@ def contexts_of(model: Model) -> dict[str, tuple[str, ...]]:
     """
     check_equations(model)
     contexts: dict[str, tuple[str, ...]] = {}
-    for name in _names_of(model, _watched(model.equations, model.max_step)):
+    for name in _names_of(model, watched(model.equations, model.max_step)):
         signal, quantity = _parts(name)
         contexts[signal] = (*contexts.get(signal, ()), *((quantity,) if quantity else ()))
     return contexts
 
 
-def _watch_name(signal: str, quantity: str = "") -> str:
+def watch_name(signal: str, quantity: str = "") -> str:
+    """Return the name of the output of `watched` equations that tells of a signal, or of a quantity of its context."""
     return f"along {signal}|{quantity}"
 
 
@@ -93,11 +94,11 @@ def _parts(name: str) -> tuple[str, str]:
     return signal, quantity
 
 
-def _names_of(model: Model, watched: Equations) -> list[str]:
+def _names_of(model: Model, reporting: Equations) -> list[str]:
     """Return the names under which the watched equations report, by tracing them once."""
 
     def outputs(values, initial, inputs):
-        return watched.measure(values, model.start(values, initial, inputs), inputs, identity)
+        return reporting.measure(values, model.start(values, initial, inputs), inputs, identity)
 
     # Shapes only, no values: there is none that every parameter can have (an area, less all of it, divides by zero).
     number = jnp.zeros(())
@@ -108,7 +109,7 @@ def _names_of(model: Model, watched: Equations) -> list[str]:
 
 
 @functools.cache
-def _watched(base: Equations, step_size: float) -> Equations:
+def watched(base: Equations, step_size: float) -> Equations:
     """Return equations whose outputs tell of the signals too: each as it is at the beginning of a step."""
 
     def measure(parameters, state, inputs, signal):
@@ -116,9 +117,9 @@ def _watched(base: Equations, step_size: float) -> Equations:
 
         def watching(name, value, **context):
             value = signal(name, value, **context)
-            if _watch_name(name) not in seen:
-                seen[_watch_name(name)] = value
-                seen.update({_watch_name(name, quantity): size for quantity, size in context.items()})
+            if watch_name(name) not in seen:
+                seen[watch_name(name)] = value
+                seen.update({watch_name(name, quantity): size for quantity, size in context.items()})
             return value
 
         base.stepper(parameters, step_size, watching)(state, lambda fraction: inputs)

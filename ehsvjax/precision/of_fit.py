@@ -1,6 +1,7 @@
 """What a fit says about its precision: the pieces of this folder put to a `Fit`."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from ehsvjax.arithmetic import settled_at
 from ehsvjax.checks import refused
 from ehsvjax.failure import warn_of_failure
 from ehsvjax.fit import Fit
+from ehsvjax.linear import LinearModel, linearise
+from ehsvjax.linear.model import ASIDE
 from ehsvjax.population import Problem, to_unit
 from ehsvjax.precision.bands import Band, deviations, new_deviations
 from ehsvjax.precision.bootstrap import Bootstrap, bootstrap
@@ -120,6 +123,32 @@ def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict
     count = len(new.names)
     spread = new_deviations(new, covariance[:count, :count], factor)[0]
     return _bands(problem.observed, spread, np.sqrt(problem.noise_variance), factor, quantile)
+
+
+def linear(
+    fit: Fit,
+    of: Prepared,
+    at: Mapping[str, float] | None,
+    initial: Mapping[str, float] | None,
+    inputs: Sequence[str] | None,
+    outputs: Sequence[str] | None,
+) -> LinearModel:
+    """Return the linear model at an operating point, with those beside it along the errors of the parameters."""
+
+    def at_values(values: np.ndarray) -> LinearModel:
+        parameters = of_no_run | dict(zip(fixed, values.tolist(), strict=True))
+        return linearise(fit.model, at, parameters=parameters, initial=initial, inputs=inputs, outputs=outputs)
+
+    # What goes by the clock of a record is absent from any other.
+    of_no_run = fit.parameters | {name: value for name, value in fit.model.of_run.items() if name in fit.parameters}
+    counted = [i for i, name in enumerate(of.problem.free) if of.first_order.seen[i] and name not in fit.model.of_run]
+    fixed = [of.problem.free[i] for i in counted]
+    scale = of.first_order.found.scale[counted]
+    variances, axes = np.linalg.eigh(of.first_order.covariance[np.ix_(counted, counted)])
+    values = np.array([fit.parameters[name] for name in fixed])
+    steps = (ASIDE * np.sqrt(np.maximum(variances, 0.0)) * axes).T * scale
+    beside = tuple((at_values(values + step), at_values(values - step)) for step in steps if np.any(step))
+    return replace(at_values(values), beside=beside)
 
 
 def _sample_variance(fit: Fit, of: Prepared) -> float:
