@@ -285,7 +285,8 @@ def of_simulation() -> Iterator[Call]:
     signals = {"text": "flow", "number": 3.0, "numbers": [1.0], "unknown": ["nobody"], "empty": [], "object": object()}
     yield from damaged("linearise", ehsvjax.linearise, {
         "model": (model, THING), "at": ({"command": 0.5}, values_of("command")), **values,
-        "initial": ({"start": 0.0}, values_of("start")), "inputs": (["command"], signals), "outputs": (["flow"], signals),
+        "initial": ({"start": 0.0}, values_of("start")),
+        "inputs": (["command"], signals), "outputs": (["flow"], signals),
     })  # fmt: skip
     variances = without(values_of("level"), "None") | {
         "None": None,
