@@ -71,4 +71,6 @@ def said(found: Diagnosis) -> dict[str, Any]:
         "groups": [a.causes for a in found.alternatives],
         "probabilities": [*alone, *grouped],
         "innocent": found.innocent,
+        # Uniform where nothing is left.
+        "p_value": found.misfit.tests_after[0].corrected if found.misfit.tests_after else 1.0,
     }
