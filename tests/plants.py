@@ -6,10 +6,11 @@ which divides by the spool's opening: a floor under the opening keeps it finite,
 
 import itertools
 import math
+import warnings
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import odeint, solve_ivp
+from scipy.integrate import ODEintWarning, odeint, solve_ivp
 
 
 class Motion(NamedTuple):
@@ -112,9 +113,10 @@ def _integrated(derivative, state, times, method, rtol, atol):
         def listed(t, y):
             return derivative(t, y.tolist())
 
-        found, report = odeint(
-            listed, state, times, tfirst=True, rtol=rtol, atol=atol, mxstep=100_000, full_output=True
-        )
+        with warnings.catch_warnings(action="ignore", category=ODEintWarning):
+            found, report = odeint(
+                listed, state, times, tfirst=True, rtol=rtol, atol=atol, mxstep=100_000, full_output=True
+            )
         if report["message"] == "Integration successful.":
             return found
         # Where it cannot go on in lock, Radau does, fifty times as slowly.

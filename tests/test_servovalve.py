@@ -56,6 +56,12 @@ def test_the_two_integrators_of_the_compressible_plant_agree():
     assert worst(radau.load_pressure, lsoda.load_pressure) < 1e3
 
 
+def test_the_plant_goes_on_where_lsoda_cannot():
+    command = held_levels(np.random.default_rng([5, 602090254]), 6e-3, 25, 200)
+    found = servovalve_plant(command, PERIOD).position
+    assert worst(simulate(servovalve(), record_of(command))["position"], found) < 2e-6
+
+
 def test_the_floor_under_the_opening_does_not_matter():
     assert worst(servovalve_plant(staircase(1), PERIOD, floor=1e-7).position, measured_plant(1).position) < 5e-8
     assert worst(servovalve_plant(staircase(1), PERIOD, floor=1e-9).position, measured_plant(1).position) < 5e-9
