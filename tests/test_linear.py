@@ -1,6 +1,9 @@
 """Linear models against closed forms, derivatives worked out by hand, and what a simulated valve does when wiggled."""
 
+from dataclasses import replace
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -172,6 +175,19 @@ def test_a_model_that_never_rests_is_refused_with_what_moves():
         ehsvjax.linearise(ehsvjax.van_der_pol(), initial={"initial_position": 1.0})
     with pytest.raises(ValueError, match="got a simulation that is not finite"):
         ehsvjax.linearise(small_models.carriage(), parameters={"stiffness": 1e9}, initial={"initial_position": 0.1})
+
+
+def _draining(parameters, state, inputs, signal):
+    del parameters
+    return {"x": signal("push", inputs["push"]) - jnp.sqrt(jnp.abs(state["x"])), "v": 0.0 * state["v"]}
+
+
+def test_a_point_where_the_equations_have_no_slope_is_refused():
+    model = replace(small_models.carriage(), stepper=ehsvjax.runge_kutta_4(_draining), signals=tuple(
+        s for s in small_models.carriage().signals if s.name != "force"))  # fmt: skip
+    assert ehsvjax.linearise(model, {"push": 2.0}).poles.real[-1] == pytest.approx(-0.25)
+    with pytest.raises(ValueError, match="got none of x, as at"):
+        ehsvjax.linearise(model)
 
 
 def test_a_delay_of_an_input_is_no_state_space():

@@ -14,7 +14,7 @@ from ehsvjax.linear.limit import continuous
 from ehsvjax.linear.model import LinearModel
 from ehsvjax.linear.rest import rested
 from ehsvjax.linear.state import as_vector, real_state, state_names
-from ehsvjax.linear.steps import first_order
+from ehsvjax.linear.steps import Step, first_order
 from ehsvjax.models.check import check_equations
 from ehsvjax.models.model import Model
 from ehsvjax.simulate import changed
@@ -43,7 +43,7 @@ def linearise(
     Raises:
         ValueError: for names that the model does not have, values that are no numbers, equations that cannot be
             simulated, an effect on a whole input (a delay, which no state space has), or a model that does not come to
-            rest there.
+            rest there, or has no slopes where it does.
 
     """
     instance("model", model, Model, "make one, such as ehsvjax.servovalve()")
@@ -72,12 +72,24 @@ def linearise(
         state = rested(model, constants, state, constant_inputs)
         disturbed = constant_inputs | as_scalars(dict.fromkeys(added, 0.0))
         step_of = functools.partial(first_order, equations, reported, constants, state, disturbed)
-        kept, (a, b, c, d) = continuous(step_of, model.max_step)
         names, values_there = state_names(state), np.asarray(as_vector(state)[0]).tolist()
+        _check_slopes(model, step_of(model.max_step), [*names, *seen])
+        kept, (a, b, c, d) = continuous(step_of, model.max_step)
         point = held | dict(zip(names, values_there, strict=True))
         point |= dict(zip(seen, step_of(model.max_step).outputs.tolist(), strict=True))
     columns = [list(disturbed).index(name) for name in acting]
     return LinearModel(a, b[:, columns], c, d[:, columns], tuple(names[i] for i in kept), acting, seen, point)
+
+
+def _check_slopes(model: Model, step: Step, named: Sequence[str]) -> None:
+    """Refuse a point where the equations have no slope, as a root has none at zero; names of states, then outputs."""
+    slopes = np.block([[step.by_state, step.by_acting], [step.outputs_by_state, step.outputs_by_acting]])
+    endless = [name for name, row in zip(named, slopes, strict=True) if not np.isfinite(row).all()]
+    if endless:
+        raise ValueError(
+            f"expected {model.name} to have slopes at its operating point, got none of {', '.join(endless)}, as at a "
+            "kink or the end of a root: hold the inputs at other values"
+        )
 
 
 def _names(model: Model, what: str, names: Any, usual: tuple[str, ...]) -> tuple[str, ...]:

@@ -35,9 +35,8 @@ def rested(model: Model, values: Mapping[str, Any], state: Any, inputs: Mapping[
         moved = (after - before) / steps
         if course is not None:
             # A rate at rest is but the rounding of what drives it.
-            coupling = np.abs(
-                first_order(model.equations, (), values, later, inputs, model.max_step).by_state - np.eye(len(after))
-            )
+            by_state = first_order(model.equations, (), values, later, inputs, model.max_step).by_state
+            coupling = np.nan_to_num(np.abs(by_state - np.eye(len(after))), nan=0.0, posinf=0.0)
             changes = np.abs(moved - course) * steps / np.maximum(np.maximum(reach, coupling @ reach), 1e-300)
             if np.all(changes <= _RESTS):
                 return later
