@@ -51,7 +51,7 @@ def extended(
         disturbed: signals to which a series of any form can be added: the model has an input `disturbance(name)` for
             each of them.
         switched: whether the effects at a signal can be skipped: the model has a constant `switch(name)` for each
-            signal that effects act on in the time loop; where it is zero they are not computed.
+            signal that effects act on while it runs; where it is zero they are not computed.
 
     """
     equations = _equations(model.equations, tuple(attached), tuple(disturbed), switched)
@@ -61,7 +61,7 @@ def extended(
     if switched:
         constants += [
             Parameter(switch(name), "on", "", 1.0, 0.0, 1.0, fixed=True, certain=True)
-            for name in effects_in_the_loop(attached)
+            for name in effects_at(attached)
         ]
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
     # An end stop on either side is the same effect twice.
@@ -91,11 +91,11 @@ def switch(signal: str) -> str:
     return f"effects at {signal}"
 
 
-def effects_in_the_loop(attached: Sequence[Candidate]) -> dict[str, list[Candidate]]:
-    """Return the effects that are computed in every step, by the signal at which they act."""
+def effects_at(attached: Sequence[Candidate]) -> dict[str, list[Candidate]]:
+    """Return the effects on what runs along the model's signals, by the signal at which they act."""
     at_signal: dict[str, list[Candidate]] = {}
     for candidate in attached:
-        if candidate.effect.kind not in ("input", "parameter", "constant"):
+        if candidate.effect.kind not in ("parameter", "constant"):
             at_signal.setdefault(candidate.signal, []).append(candidate)
     return at_signal
 
@@ -114,7 +114,7 @@ def effects_of(model: Model) -> tuple[str, ...]:
 @functools.cache
 def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[str, ...], switched: bool) -> Equations:
     """Return the equations with effects, the same objects for the same effects."""
-    inputs = tuple(c for c in attached if c.effect.kind == "input")
+    inputs = effects_at([c for c in attached if c.effect.kind == "input"])
     given_wrong = tuple(c for c in attached if c.effect.kind == "constant")
     drifting = tuple(c for c in attached if c.effect.kind == "parameter")
     remembering = tuple(c for c in attached if c.effect.memory and c.effect.kind != "input")
@@ -122,7 +122,7 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     inside = {_slot(c) for c in remembering} - sensing
     sensors = [name for name in base.outputs if any(c.signal == name for c in remembering)]
     names = (*base.inputs, *(disturbance(place) for place in places))
-    at_signal = effects_in_the_loop(attached)
+    at_signal = effects_at([c for c in attached if c.effect.kind != "input"])
 
     def own_of(candidate, parameters):
         return {p.name: parameters[candidate.parameter(p.name)] for p in candidate.effect.parameters}
@@ -239,8 +239,14 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
         time = sample_period * jnp.arange(series.shape[0], dtype=series.dtype)
         context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
         columns = dict(zip(names, jnp.moveaxis(series, -1, 0), strict=True))
-        for c in inputs:
-            columns[c.signal] = c.effect.apply(own_of(c, parameters), columns[c.signal], context)
+        for name, effects in inputs.items():
+
+            def behind_effects(column, effects=effects):
+                for c in effects:
+                    column = c.effect.apply(own_of(c, parameters), column, context)
+                return (column,)
+
+            (columns[name],) = where_on(parameters, [name], behind_effects, columns[name])
         return jnp.stack([columns[name] for name in names], axis=-1)
 
     return base._replace(

@@ -6,6 +6,7 @@ The paper's figures are lost; where its transfer function sits is read in three 
 import functools
 from typing import Any, Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 
 from ehsvjax import hydraulics
@@ -301,15 +302,12 @@ def _load_stage(parameters, h, signal):
     """
     area = parameters["piston_area"]
     retraction_area = signal("retraction_area", area)
-    out = _load_equations(parameters, area, h, signal)
-    if retraction_area is area:
-        motion = out
-    else:
-        back = _load_equations(parameters, retraction_area, h, signal)
+    out = _load_coefficients(parameters, area, h, signal)
+    back = out if retraction_area is area else _load_coefficients(parameters, retraction_area, h, signal)
 
-        def motion(position, velocity, pressure, opening, supply, force):
-            forward, backward = (part(position, velocity, pressure, opening, supply, force) for part in (out, back))
-            return tuple(jnp.where(opening < 0.0, b, f) for f, b in zip(forward, backward, strict=True))
+    def motion(position, velocity, pressure, opening, supply, force):
+        side = out if back is out else jax.tree.map(functools.partial(jnp.where, opening < 0.0), back, out)
+        return _motion(parameters, side, h, position, velocity, pressure, opening, supply, force)
 
     def stage(position, velocity, pressure, opening, supply, force, friction):
         if isinstance(friction, float) and friction == 0.0:
@@ -325,33 +323,44 @@ def _load_stage(parameters, h, signal):
     return stage
 
 
-def _load_equations(parameters, area, h, signal):
-    """Return the stage without dry friction, for one piston area."""
-    mass, stiffness = parameters["mass"], parameters["stiffness"]
+class _LoadCoefficients(NamedTuple):
+    """What of a stage does not change from step to step, for one piston area: a reciprocal serves every step."""
+
+    flow_by_momentum: Any
+    pressure_by_flow: Any
+    half_slope_by_opening: Any
+    per_area: Any
+    storage: Any
+    leakage: Any
+
+
+def _load_coefficients(parameters, area, h, signal):
     storage = signal("hydraulic_capacitance", parameters["hydraulic_capacitance"]) / h
     leakage = signal("leakage_coefficient", parameters["leakage_coefficient"])
-    # What does not change is divided by once, here: a reciprocal serves every step.
-    flow_by_momentum = area / (mass + h * h * stiffness)
+    flow_by_momentum = area / (parameters["mass"] + h * h * parameters["stiffness"])
     pressure_by_flow = 1.0 / (h * area * flow_by_momentum + leakage + storage)
     half_slope_by_opening = 0.5 * parameters["flow_gain"] * pressure_by_flow
-    per_area = 1.0 / area
+    return _LoadCoefficients(
+        flow_by_momentum, pressure_by_flow, half_slope_by_opening, 1.0 / area, storage, leakage
+    )
 
-    def motion(position, velocity, pressure, opening, supply, force):
-        momentum = mass * velocity - h * (stiffness * position + force)
-        flow_at_rest = flow_by_momentum * momentum - storage * pressure
-        direction = jnp.where(opening < 0.0, -1.0, 1.0)
-        half_slope = half_slope_by_opening * jnp.abs(opening)
-        drop = supply + direction * flow_at_rest * pressure_by_flow
-        square = half_slope * half_slope + jnp.abs(drop)
-        # Closed, and just balanced by the load: no flow, and no derivative of a root of zero.
-        flowing = square > 0.0
-        root = jnp.where(flowing, drop / (half_slope + jnp.sqrt(jnp.where(flowing, square, 1.0))), 0.0)
-        flow = parameters["flow_gain"] * opening * root
-        pressure_end = (flow - flow_at_rest) * pressure_by_flow
-        velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) * per_area
-        return position + h * velocity_end, velocity_end, pressure_end
 
-    return motion
+def _motion(parameters, coefficients, h, position, velocity, pressure, opening, supply, force):
+    """Return position, velocity and pressure at the end of a stage without dry friction."""
+    flow_by_momentum, pressure_by_flow, half_slope_by_opening, per_area, storage, leakage = coefficients
+    momentum = parameters["mass"] * velocity - h * (parameters["stiffness"] * position + force)
+    flow_at_rest = flow_by_momentum * momentum - storage * pressure
+    direction = jnp.where(opening < 0.0, -1.0, 1.0)
+    half_slope = half_slope_by_opening * jnp.abs(opening)
+    drop = supply + direction * flow_at_rest * pressure_by_flow
+    square = half_slope * half_slope + jnp.abs(drop)
+    # Closed, and just balanced by the load: no flow, and no derivative of a root of zero.
+    flowing = square > 0.0
+    root = jnp.where(flowing, drop / (half_slope + jnp.sqrt(jnp.where(flowing, square, 1.0))), 0.0)
+    flow = parameters["flow_gain"] * opening * root
+    pressure_end = (flow - flow_at_rest) * pressure_by_flow
+    velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) * per_area
+    return position + h * velocity_end, velocity_end, pressure_end
 
 
 def _flow_force_stroke(parameters, opening, supply, load_pressure):

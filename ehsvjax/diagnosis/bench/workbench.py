@@ -9,6 +9,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax import arithmetic
 from ehsvjax.effects.effect import Candidate, EffectParameter, Scales, constant_of
-from ehsvjax.effects.extended import effects_in_the_loop, switch
+from ehsvjax.effects.extended import effects_at, switch
 from ehsvjax.effects.internal import Internal
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
@@ -145,8 +146,9 @@ class Workbench:
 
         def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
             some = points[first : first + _ABREAST]
-            added = np.repeat(self.disturbances[None], _ABREAST, axis=0)
+            added: Any = self._always_added
             if disturbances is not None:
+                added = np.repeat(self.disturbances[None], _ABREAST, axis=0)
                 added[: len(some)] += disturbances[first : first + _ABREAST]
             # The setting is that of a thread.
             with jax.enable_x64(True):
@@ -154,8 +156,7 @@ class Workbench:
                 acting = replace(problem, known=problem.known | self._acting(some))
                 return np.asarray(_simulated(acting, filled, jnp.asarray(added)))[: len(some)]
 
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            every = np.concatenate(list(pool.map(outputs, range(0, len(points), _ABREAST))))
+        every = np.concatenate(list(_threads().map(outputs, range(0, len(points), _ABREAST))))
         # What comes after the end of a record is nothing, whatever the model would do there.
         every[:, ~self.present] = 0.0
         return every
@@ -170,8 +171,14 @@ class Workbench:
         """Columns of the numbers that make effects vanish, by the switch that skips these effects."""
         return {
             switch(signal): [j for c in some for number, j in self.unknowns_of(c) if number.absent is not None]
-            for signal, some in effects_in_the_loop(self.candidates).items()
+            for signal, some in effects_at(self.candidates).items()
         }
+
+    @functools.cached_property
+    def _always_added(self) -> Float[Array, "individual record time place"]:
+        """What is added to signals in every simulation, side by side; to copy it takes as long as some simulations."""
+        with jax.enable_x64(True):
+            return jnp.asarray(np.repeat(self.disturbances[None], _ABREAST, axis=0))
 
     @functools.cached_property
     def _on_device(self) -> Problem:
@@ -231,6 +238,12 @@ class Workbench:
         largest = np.max(np.abs(outputs), axis=(1, 2, 3))
         change[np.max(np.abs(change), axis=(1, 2, 3)) < ROUNDING * largest] = 0.0
         return change / self.differences[columns, None, None, None]
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """Return one thread for each core. They stay: what a new one has to set up takes as long as some simulations."""
+    return ThreadPoolExecutor(os.cpu_count())
 
 
 def duration_of(records: Sequence[Record]) -> float:
