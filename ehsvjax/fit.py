@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from ehsvjax.checks import by_name, choice, number, refused
 from ehsvjax.failure import warn_of_failure
-from ehsvjax.models.model import Model
+from ehsvjax.models.model import Model, tied_values
 from ehsvjax.record import Record, checked_record
 from ehsvjax.score import Score, differences, score_of
 from ehsvjax.simulate import simulate
@@ -124,6 +124,11 @@ class Fit:
     def outputs(self) -> tuple[str, ...]:
         """Names of the outputs that were fitted."""
         return tuple(self.noise_variance)
+
+    @property
+    def tied(self) -> dict[str, float]:
+        """Name -> value of each parameter that follows others, SI."""
+        return tied_values(self.model.ties, self.model.nominal | self.parameters)
 
     @property
     def cost(self) -> float:

@@ -2,8 +2,9 @@
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +54,8 @@ def identify(
     fixed: Mapping[str, float] | None = None,
     initial: Initial = "estimate",
     start: Mapping[str, float] | None = None,
+    priors: Mapping[str, tuple[float, float]] | None = None,
+    tied: Mapping[str, Callable[..., Any]] | None = None,
     refine: bool = True,
     noise_variance: Mapping[str, float] | None = None,
     huber: float | None = None,
@@ -83,6 +86,9 @@ def identify(
             are known by name (the others are estimated), one mapping for all records or one for each.
         start: name -> value, SI, of a guess that joins the first population; parameters that it does not name are
             nominal.
+        priors: name -> (mean, standard deviation), SI, of what is known of a parameter beforehand; it counts as one
+            more reading, in the cost, in errors and in prints.
+        tied: name -> function of all parameters by name, `{"b": lambda p: 2.0 * p["a"]}`, for those that follow others.
         refine: whether the gradient refinement follows the search.
         noise_variance: name of the output -> variance, unit squared, where it is known.
         huber: residuals beyond this many standard deviations weigh linearly (1.345 is usual), for records with spikes.
@@ -110,7 +116,7 @@ def identify(
     whole("islands", islands, 1)
     devices = None if devices is None else _checked_devices(devices)
     cost = population_cost if devices is None or islands > 1 else shared_cost(devices)
-    model = model.with_bounds(bounds, fixed)
+    model = model.with_bounds(bounds, fixed).with_ties(tied).with_priors(priors)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
     check_sizes(population, generations, operators, islands, problem.unknowns)
     whole("starts", starts, 1, population * islands, "at most as many as there are individuals")

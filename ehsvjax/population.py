@@ -52,9 +52,16 @@ class Coordinates(NamedTuple):
     logarithmic: Bool[Any, " parameter"]
 
 
+class Priors(NamedTuple):
+    """What is known of each unknown beforehand, as if it had been measured: an infinite deviation knows nothing."""
+
+    mean: Float[Any, " parameter"]
+    deviation: Float[Any, " parameter"]
+
+
 @functools.partial(
     jax.tree_util.register_dataclass,
-    data_fields=["samples", "noise_variance", "coordinates", "known", "known_initial", "substeps"],
+    data_fields=["samples", "noise_variance", "coordinates", "known", "known_initial", "substeps", "priors"],
     meta_fields=["equations", "grid", "observed", "free", "free_initial", "huber", "free_by_record"],
 )
 @dataclass(frozen=True)
@@ -74,6 +81,7 @@ class Problem:
         huber: residuals beyond this many standard deviations weigh linearly (Huber 1964); None: squares; static.
         substeps: integration steps per sample as data, for one program at any step; None: as many as the grid says.
         free_by_record: names of parameters that are free and may be another in every record, static.
+        priors: of the unknowns; None where nothing is known of any.
 
     """
 
@@ -90,6 +98,7 @@ class Problem:
     huber: float | None
     substeps: Any = None
     free_by_record: tuple[str, ...] = ()
+    priors: Priors | None = None
 
     @property
     def names(self) -> list[str]:
@@ -195,6 +204,8 @@ def cast(problem: Problem, dtype) -> Problem:
 def population_cost(problem: Problem, individuals: Float[Array, "individual parameter"]) -> Float[Array, " individual"]:
     """Cost of every individual: the sum of squares of its standardised residuals, over records, time and outputs.
 
+    What is known of unknowns beforehand counts as further readings.
+
     Standardised residuals are divided by the noise's standard deviation, so that the truth costs about the number of
     samples; beyond `huber` they weigh linearly. No trajectory is stored. A simulation that fails costs +inf.
     It can be differentiated by the individuals, once; not by the problem.
@@ -222,7 +233,17 @@ def population_cost(problem: Problem, individuals: Float[Array, "individual para
     cost = jax.custom_jvp(by_record)
     cost.defjvp(differential)
     total = jnp.sum(cost(individuals), axis=1)
+    if problem.priors is not None:
+        total = total + jnp.sum(prior_residuals(problem, individuals) ** 2, axis=1)
     return jnp.where(jnp.isnan(total), jnp.inf, total)
+
+
+def prior_residuals(
+    problem: Problem, individuals: Float[Array, "individual parameter"]
+) -> Float[Array, "individual parameter"]:
+    """How far each unknown lies from what is known of it, in standard deviations; the problem has priors."""
+    assert problem.priors is not None
+    return (to_values(problem.coordinates, individuals) - problem.priors.mean[None]) / problem.priors.deviation[None]
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax.checks import number, positive, refused, whole
-from ehsvjax.population import Problem, huber_weight, population_cost, residuals, robust_square
+from ehsvjax.population import Problem, huber_weight, population_cost, prior_residuals, residuals, robust_square
 
 
 class Refined(NamedTuple):
@@ -248,4 +248,9 @@ def cost_gradient_information(problem: Problem, individuals: Float[Array, "indiv
     gradient = jnp.einsum("pit,it->ip", weighted, r.reshape(count, -1))
     information = jnp.einsum("pit,qit->ipq", weighted, flat)
     cost = jnp.sum(robust_square(r, problem.huber).reshape(count, -1), axis=1)
+    if problem.priors is not None:
+        # Each depends on its own coordinate alone.
+        off, slope = jax.jvp(functools.partial(prior_residuals, problem), (individuals,), (jnp.ones_like(individuals),))
+        cost, gradient = cost + jnp.sum(off**2, axis=1), gradient + slope * off
+        information = information + jax.vmap(jnp.diag)(slope**2)
     return jnp.where(jnp.isnan(cost), jnp.inf, cost), gradient, information, r

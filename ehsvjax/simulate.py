@@ -96,10 +96,12 @@ def changed(
     """Return nominal values with changes; `kind` says what they are, "parameters" or "initial conditions".
 
     Raises:
-        ValueError: for a name that is none of the nominal ones', or a value that is no finite number.
+        ValueError: for a name that is none of the nominal ones', or is tied, or a value that is no finite number.
 
     """
     changes = by_name(kind, changes, "{'mass': 20.0}")
+    # All values of a model may be handed back, those of parameters that follow others among them.
+    model.check_untied([name for name, value in changes.items() if value != nominal.get(name)])
     for name, value in changes.items():
         model.parameter(name)
         if name not in nominal:
@@ -113,9 +115,10 @@ def constants_of(model: Model, record: Record) -> dict[str, float]:
     """Return what is known of a model's parameters in a record.
 
     Raises:
-        ValueError: for a name that is no parameter of the model.
+        ValueError: for a name that is no parameter of the model, or one that is tied to others.
 
     """
+    model.check_untied(record.constants)
     for name in record.constants:
         if name not in model.nominal:
             raise ValueError(

@@ -111,9 +111,9 @@ def with_nominal_initial(problem: Problem, model: Model, individual) -> Float[np
 def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refined, int, Problem]:
     """Refine; then, while weights, step or readings that are known change, refine again with those found there.
 
-    With one output and squared residuals its weight does not move the minimum. The last of the starts has nominal
-    initial conditions if any are free, as `candidates` gives them. The number returned says how many starts came to the
-    same minimum.
+    With one output, squared residuals and no priors its weight does not move the minimum. The last of the starts has
+    nominal initial conditions if any are free, as `candidates` gives them. The number returned says how many starts
+    came to the same minimum.
     """
     # A longer step may not know what a shorter one does, so that all readings are asked again. At one and the same step
     # what was left out stays out, lest readings come and go.
@@ -125,7 +125,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
         nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
         refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
         agreeing = _agreeing(problem, refined)
-        several = len(problem.observed) > 1 or problem.huber is not None
+        weighed = len(problem.observed) > 1 or problem.huber is not None or problem.priors is not None
         for _ in range(_ROUNDS):
             best = np.argmin(refined.cost)
             before = problem
@@ -142,7 +142,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
                 # asked again, there may be no way back.
                 starts = np.vstack([starts[:-1], np.concatenate([starts[best, :own], nominal_initial])])
             same = known.substeps == before.substeps and np.array_equal(known.samples.measured, before.samples.measured)
-            if same and (not several or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
+            if same and (not weighed or np.allclose(problem.noise_variance, before.noise_variance, rtol=0.01)):
                 break
             problem = known
             # From where each start has led: what kept them apart may have been the arithmetic.

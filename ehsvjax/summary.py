@@ -90,6 +90,9 @@ NOT_FINITE = "not finite"
 _LEAST_WORTH = 0.001
 # Correlations that are printed, as in lmfit's reports.
 _LEAST_CORRELATION = 0.5
+# Of what was known of a parameter beforehand: information of all else that is next to none; standard deviations between
+# the two that are no chance.
+_LEAST_TOLD, _CONTRADICTED = 1e-3, 3.0
 _RECORD_HEAD = ("name", "samples", "missing", "period", "duration")
 
 
@@ -112,6 +115,9 @@ def _sections(fit: Fit) -> Iterator[_Section]:
     yield _Section("Outputs", _output_rows(fit), _OUTPUT_HEAD)
     precision = _precision_of(fit)
     yield _Section("Parameters", [_parameter_row(fit, precision, p) for p in fit.model.parameters], _PARAMETER_HEAD)
+    priors = [_prior_row(fit, precision, p) for p in fit.model.parameters if p.prior and p.name in fit.parameters]
+    if priors:
+        yield _Section("Known beforehand", priors, ("name", "value", "unit", "from all else", ""))
     if isinstance(precision, Precision):
         yield from _precision_sections(precision)
     else:
@@ -135,6 +141,8 @@ def _unfitted_row(parameter: Parameter) -> tuple[str, ...]:
     bounds = f"{parameter.lower:.6g} .. {parameter.upper:.6g}"
     if parameter.fixed:
         bounds = "(fixed, certain)" if parameter.certain else "(fixed)"
+    elif parameter.prior:
+        bounds += f", known as {parameter.prior[0]:.6g} +/- {parameter.prior[1]:.3g}"
     return parameter.name, parameter.symbol, f"{parameter.value:.6g}", parameter.unit, bounds
 
 
@@ -250,10 +258,27 @@ def _output_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
 
 def _parameter_row(fit: Fit, precision: Precision | str, parameter: Parameter) -> tuple[str, ...]:
     name, symbol, unit = parameter.name, parameter.symbol, parameter.unit
+    if name in fit.tied:
+        return name, symbol, f"{fit.tied[name]:.6g}", "", unit, "(tied)"
     if name not in fit.parameters:
         return name, symbol, f"{parameter.value:.6g}", "", unit, "(fixed)"
     bounds = f"{parameter.lower:.6g} .. {parameter.upper:.6g}"
     return name, symbol, f"{fit.parameters[name]:.6g}", _error(precision, name), unit, bounds
+
+
+def _prior_row(fit: Fit, precision: Precision | str, parameter: Parameter) -> tuple[str, ...]:
+    """Return what was known of a parameter beside what all else says of it, and how far apart they are."""
+    assert parameter.prior is not None
+    name, (mean, deviation) = parameter.name, parameter.prior
+    row = name, f"{mean:.6g} +/- {deviation:.3g}", parameter.unit
+    error = math.inf if isinstance(precision, str) else precision.standard_errors[name]
+    information = 1.0 / error**2 - 1.0 / deviation**2 if error > 0.0 else math.inf
+    if not _LEAST_TOLD / deviation**2 < information < math.inf:
+        return *row, "next to nothing", ""
+    other = (fit.parameters[name] / error**2 - mean / deviation**2) / information
+    apart = abs(other - mean) / math.hypot(information**-0.5, deviation)
+    words = f"{apart:.1f} standard deviations apart" + (": they contradict each other" if apart > _CONTRADICTED else "")
+    return *row, f"{other:.6g} +/- {information**-0.5:.3g}", words
 
 
 def _quantity(value: float, unit: str) -> str:

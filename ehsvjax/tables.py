@@ -19,11 +19,11 @@ def parameter_table(fit: Fit) -> pd.DataFrame:
         errors = fit.standard_errors
     except ValueError:
         errors = {}
-    parameters = fit.model.parameters
+    parameters, values = fit.model.parameters, fit.tied | fit.parameters
     return pd.DataFrame(
         {
             "symbol": [p.symbol for p in parameters],
-            "value": [fit.parameters.get(p.name, p.value) for p in parameters],
+            "value": [values.get(p.name, p.value) for p in parameters],
             "standard_error": [errors.get(p.name, float("nan")) for p in parameters],
             "unit": [p.unit for p in parameters],
             "lower": [p.lower if p.name in fit.parameters else float("nan") for p in parameters],

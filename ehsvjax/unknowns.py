@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ehsvjax.checks import by_name, number, positive, refused
 from ehsvjax.models.model import Model, Parameter
-from ehsvjax.population import Coordinates, Problem, coordinates_of, observed_outputs, stack_records
+from ehsvjax.population import Coordinates, Priors, Problem, coordinates_of, observed_outputs, stack_records
 from ehsvjax.record import Record
 
 _HUBER = "a positive number of standard deviations or None"
@@ -74,8 +74,17 @@ def problem_of(
         free=free,
         free_initial=free_initial,
         free_by_record=tuple(by_record),
+        priors=_priors(unknowns),
         huber=None if huber is None else number("huber", huber, _HUBER, lambda x: x > 0.0, "1.345 is usual"),
     )
+
+
+def _priors(unknowns: Sequence[Parameter]) -> Priors | None:
+    """Return what is known of unknowns beforehand."""
+    if all(p.prior is None for p in unknowns):
+        return None
+    mean, deviation = zip(*(p.prior or (0.0, np.inf) for p in unknowns), strict=True)
+    return Priors(np.array(mean), np.array(deviation))
 
 
 def where_to_search(model: Model, records: Sequence[Record], problem: Problem) -> Coordinates:

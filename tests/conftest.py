@@ -12,6 +12,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1]
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 
 import jax
+import jaxtyping
+import pytest
 from beartype import BeartypeConf
 from jaxtyping import install_import_hook
 
@@ -32,3 +34,9 @@ def _install():
 
 _install()
 install_import_hook("ehsvjax", _typechecker)
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Let wrong types through to the package's own checks, as they are for a user."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

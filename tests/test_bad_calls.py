@@ -5,7 +5,6 @@ import time
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 
@@ -20,12 +19,6 @@ from ehsvjax.models.check import check_equations
 from ehsvjax.models.model import KINDS
 
 ROOMS = ("of_excitation", "of_operators", "of_models", "of_hydraulics", "of_effects", "of_simulation")
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """Let wrong types through to the package's own checks, as they are for a user."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.mark.usefixtures("unchecked")

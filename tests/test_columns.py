@@ -3,7 +3,6 @@
 import os
 import pickle
 
-import jaxtyping
 import numpy as np
 import pandas as pd
 import pytest
@@ -28,12 +27,6 @@ WANTED = {
     "outputs": {"position": Column("position_V", scale=0.02, offset=-0.1), "raw": "position_V"},
 }
 PLAIN = {"time": "t", "inputs": {"command": "u"}, "outputs": {"position": "y"}}
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """Let wrong types through to the package's own checks, as they are for a user."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture

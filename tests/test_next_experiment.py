@@ -4,7 +4,6 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -35,12 +34,6 @@ def stroke(values, name="bench", noise=NOISE):
     position = carriage_plant(values, PERIOD)[:, 0]
     measured = position + noise * np.random.default_rng(9).standard_normal(len(values))
     return ehsvjax.Record(PERIOD * np.arange(len(values)), {"push": values}, {"position": measured}, name=name)
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """Let wrong types through to the package's own checks, as they are for a user."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ import copy
 import pickle
 from dataclasses import FrozenInstanceError, replace
 
-import jaxtyping
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,12 +18,6 @@ NAN, INF = np.nan, np.inf
 TIME = np.array([0.0, 0.1, 0.2, 0.3, 0.4])
 COMMAND = np.array([0.0, 1.0, 1.0, -1.0, -1.0])
 POSITION = np.array([0.0, 0.1, 0.3, 0.5, 0.2])
-
-
-@pytest.fixture
-def unchecked(monkeypatch):
-    """Let wrong types through to the record's own checks, as they are for a user."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
 
 
 def floats(*values):

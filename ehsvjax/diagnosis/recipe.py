@@ -52,7 +52,7 @@ def diagnose(
 
     Several records share the parameters of the model and the causes; each has its own length, sample period, outputs,
     known constants, initial conditions and noise, and of a cause that goes by its clock, a drift or a periodic force,
-    its own amplitudes.
+    its own amplitudes. Priors of the fit are left aside: the records alone are asked.
 
     Args:
         fit: of the model, by `identify`.
@@ -87,7 +87,8 @@ def _diagnosed(
     say: Progress,
 ) -> Diagnosis:
     say("simulating the model", 0.0)
-    bench = workbench(fit, records, bank)
+    # The records alone are asked: what was believed of the model may be what is wrong with it.
+    bench = workbench(replace(fit, model=fit.model.without_priors()), records, bank)
     check_own_effects(bench, bank)
     bench, outliers = _without_spikes(bench)
     selection = select(bench, say)

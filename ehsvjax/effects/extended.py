@@ -60,8 +60,7 @@ def extended(
     ]  # fmt: skip
     if switched:
         constants += [
-            Parameter(switch(name), "on", "", 1.0, 0.0, 1.0, fixed=True, certain=True)
-            for name in effects_at(attached)
+            Parameter(switch(name), "on", "", 1.0, 0.0, 1.0, fixed=True, certain=True) for name in effects_at(attached)
         ]
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
     # An end stop on either side is the same effect twice.

@@ -16,7 +16,8 @@ A fourth, `prepare(parameters, inputs, sample_period) -> inputs`, may change the
 """
 
 import difflib
-from collections.abc import Callable, Collection, Mapping
+import functools
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
@@ -46,7 +47,8 @@ class Parameter(NamedTuple):
     "log" for positive quantities known by their order of magnitude. For an initial condition, `output` names the output
     whose first samples tell about where it lies, if that output is measured: the search begins there. The bounds stand,
     but where those samples lie beyond them; bounds given to `identify` stand in any case. A constant is taken to be
-    what it is given as, and may have been given wrong: `diagnose` tries that too, unless it is `certain`.
+    what it is given as, and may have been given wrong: `diagnose` tries that too, unless it is `certain`. `prior` is
+    what is known of an unknown beforehand, its mean and its standard deviation, as if it had been measured so.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Parameter(NamedTuple):
     fixed: bool = False
     output: str | None = None
     certain: bool = False
+    prior: tuple[float, float] | None = None
 
 
 KINDS = (
@@ -109,6 +112,7 @@ class Model:
         max_step: longest integration step, s; a sample is divided into as many equal steps as this needs.
         options: how the model was made, for prints and for `Fit.save`.
         layers: the effects that it was extended by (`ehsvjax.effects.Candidate`), one tuple for each extension.
+        ties: name of a constant and the function of all parameters that it is, one pair for each (`with_ties`).
 
     Raises:
         ValueError: for names that repeat or are none (empty, with blanks at their ends, of two lines), a kind of signal
@@ -129,6 +133,7 @@ class Model:
     options: tuple[tuple[str, Any], ...] = ()
     prepare: Callable[..., Any] | None = None
     layers: tuple[tuple[Any, ...], ...] = ()
+    ties: tuple[tuple[str, Callable[..., Any]], ...] = ()
 
     def __post_init__(self):
         """Refuse what cannot be a model."""
@@ -249,12 +254,14 @@ class Model:
         """Return the model with other bounds (which frees a constant) and with parameters fixed at values.
 
         Raises:
-            ValueError: for an unknown name, a name in both, bounds out of order, or what is no number.
+            ValueError: for an unknown name, a name in both, one that is tied, bounds out of order, or what is no
+                number.
 
         """
         bounds, fixed = by_name("bounds", bounds, '{"mass": (10.0, 30.0)}'), by_name("fixed", fixed, '{"mass": 20.0}')
         for name in (*bounds, *fixed):
             self.parameter(name)
+        self.check_untied((*bounds, *fixed))
         both = sorted(set(bounds) & set(fixed))
         if both:
             raise ValueError(f"expected each parameter to be either bounded or fixed, got both for {', '.join(both)}")
@@ -276,6 +283,136 @@ class Model:
             parameters=tuple(changed(p) for p in self.parameters),
             initial=tuple(changed(p) for p in self.initial),
         )
+
+    def check_untied(self, names: Collection[str]) -> None:
+        """Refuse values of parameters that follow others.
+
+        Raises:
+            ValueError: naming the first.
+
+        """
+        for name in names:
+            if name in dict(self.ties):
+                raise ValueError(
+                    f"expected no value of {name}, which is tied to other parameters of {self.name}: give theirs"
+                )
+
+    def with_priors(self, priors: Mapping[str, tuple[float, float]] | None = None) -> "Model":
+        """Return the model with what is known of unknowns beforehand: name -> (mean, standard deviation), SI.
+
+        Raises:
+            ValueError: for a name that is no unknown parameter, or what is no mean with a positive deviation.
+
+        """
+        priors = by_name("priors", priors, '{"mass": (20.0, 0.5)}')
+        for name in priors:
+            if name not in self.free:
+                known = ", ".join(self.free) or "none"
+                raise ValueError(
+                    f"expected priors of parameters that are to be identified, {known}; got {name!r}: free it by bounds"
+                )
+        given = {name: as_prior(name, prior) for name, prior in priors.items()}
+        return replace(self, parameters=tuple(p._replace(prior=given.get(p.name, p.prior)) for p in self.parameters))
+
+    def without_priors(self) -> "Model":
+        """Return the model of whose parameters nothing is known beforehand."""
+        return replace(self, parameters=tuple(p._replace(prior=None) for p in self.parameters))
+
+    def with_ties(self, ties: Mapping[str, Callable[..., Any]] | None = None) -> "Model":
+        """Return the model with parameters that are functions of others: name -> function of all, by name, to a number.
+
+        What is tied is no unknown any longer, and no constant that may have been given wrong. A function in the manner
+        of the equations: `lambda p: 2.0 * p["damping"]`, of JAX.
+
+        Raises:
+            ValueError: for an unknown name, what is no function, or one that gives no finite number of the nominal
+                values.
+
+        """
+        ties = by_name("tied", ties, '{"b": lambda p: 2.0 * p["a"]}')
+        if not ties:
+            return self
+        self.check_untied(ties)
+        for name, tie in ties.items():
+            if self.parameter(name) not in self.parameters:
+                raise ValueError(f"expected tied to name parameters of {self.name}, got {name!r}, an initial condition")
+            function(f"the tie of {name}", tie, "lambda p: 2.0 * p['a']")
+        pairs = tuple(ties.items())
+        values = tied_values(pairs, self.nominal)
+        equations = _tied(self.equations, pairs)
+        return replace(
+            self,
+            parameters=tuple(
+                p._replace(value=values[p.name], fixed=True, certain=True, prior=None) if p.name in ties else p
+                for p in self.parameters
+            ),
+            start=equations.start,
+            stepper=equations.stepper,
+            measure=equations.measure,
+            prepare=equations.prepare,
+            ties=(*self.ties, *pairs),
+        )
+
+
+def tied_values(ties: Sequence[tuple[str, Callable[..., Any]]], parameters: Mapping[str, float]) -> dict[str, float]:
+    """Return the value of each tied parameter at values of all, SI; one may be tied to another before it.
+
+    Raises:
+        ValueError: naming the tie that gives no finite number.
+
+    """
+    values, found = dict(parameters), dict[str, float]()
+    for name, tie in ties:
+        try:
+            value = as_number(np.asarray(tie(values)).item())
+        except Exception as error:
+            reason = f"{type(error).__name__} ({str(error).partition(chr(10))[0]})"
+            raise ValueError(
+                f"expected the tie of {name} to be a function of {', '.join(values)}, got {reason}: give a function of "
+                "a dict of all parameters, such as lambda p: 2.0 * p['a']"
+            ) from error
+        if value is None or not np.isfinite(value):
+            raise ValueError(f"expected the tie of {name} to give a finite number, got {value}: look at its values")
+        values[name] = found[name] = value
+    return found
+
+
+@functools.cache
+def _tied(equations: Equations, ties: tuple[tuple[str, Callable[..., Any]], ...]) -> Equations:
+    """Return equations of which some parameters are functions of others, the same objects for the same ties."""
+
+    def with_ties(parameters):
+        values = dict(parameters)
+        for name, tie in ties:
+            values[name] = tie(values)
+        return values
+
+    def tied(function):
+        return None if function is None else lambda parameters, *others: function(with_ties(parameters), *others)
+
+    return equations._replace(
+        start=tied(equations.start),
+        stepper=tied(equations.stepper),
+        measure=tied(equations.measure),
+        prepare=tied(equations.prepare),
+    )
+
+
+def as_prior(name: str, prior: Any) -> tuple[float, float]:
+    """Return a prior as two numbers.
+
+    Raises:
+        ValueError: if it is no pair of a mean and a positive standard deviation.
+
+    """
+    given = map(as_number, prior) if isinstance(prior, tuple | list | np.ndarray) else ()
+    pair = [value for value in given if value is not None and np.isfinite(value)]
+    if len(pair) != 2 or len(prior) != 2 or pair[1] <= 0.0:
+        raise ValueError(
+            f"expected the prior of {name} as (mean, standard deviation), the latter positive, got {prior!r}: give two "
+            "numbers, SI"
+        )
+    return pair[0], pair[1]
 
 
 def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
@@ -321,6 +458,8 @@ def check_bounds(parameter: Parameter) -> None:
     text(f"the unit of {name}", parameter.unit)
     choice(f"the scale of {name}", parameter.scale, ("linear", "log"))
     flag(f"fixed of {name}", parameter.fixed)
+    if parameter.prior is not None:
+        as_prior(name, parameter.prior)
     number(name, value, remedy="give its nominal value, SI")
     as_bounds(name, (lower, upper))
     if parameter.scale == "log" and value < 0:

@@ -340,9 +340,7 @@ def _load_coefficients(parameters, area, h, signal):
     flow_by_momentum = area / (parameters["mass"] + h * h * parameters["stiffness"])
     pressure_by_flow = 1.0 / (h * area * flow_by_momentum + leakage + storage)
     half_slope_by_opening = 0.5 * parameters["flow_gain"] * pressure_by_flow
-    return _LoadCoefficients(
-        flow_by_momentum, pressure_by_flow, half_slope_by_opening, 1.0 / area, storage, leakage
-    )
+    return _LoadCoefficients(flow_by_momentum, pressure_by_flow, half_slope_by_opening, 1.0 / area, storage, leakage)
 
 
 def _motion(parameters, coefficients, h, position, velocity, pressure, opening, supply, force):

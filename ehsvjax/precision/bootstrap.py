@@ -112,8 +112,14 @@ def bootstrap(
             relative = _blocks(random, residuals, problem.samples.measured[..., i], noise, draws)
         drawn[..., i] = simulated[..., i] + deviation[i] * relative
     start = np.clip(to_unit(problem.coordinates, values), 0.0, 1.0)
+    known = None
+    if problem.priors is not None:
+        # What is known beforehand is a reading too, and drawn anew as they are.
+        off = np.where(np.isfinite(problem.priors.deviation), problem.priors.deviation, 0.0)
+        known = values + off * random.standard_normal((draws, len(values)))
     with jax.enable_x64(True):
-        individuals, converged = _refits(cast(problem, jnp.float64), jnp.asarray(drawn), jnp.asarray(start))
+        drawn_anew = jnp.asarray(drawn), None if known is None else jnp.asarray(known)
+        individuals, converged = _refits(cast(problem, jnp.float64), drawn_anew, jnp.asarray(start))
     refitted, good = to_values(problem.coordinates, np.asarray(individuals)), np.asarray(converged)
     if not good.all():
         words = f"{np.sum(~good)} of {draws} refits failed or did not converge, and are left out"
@@ -126,12 +132,17 @@ def bootstrap(
 
 
 @jax.jit
-def _refits(problem: Problem, outputs: Float[Array, "draw record time signal"], start: Float[Array, " parameter"]):
-    def refit(outputs):
-        found = refine(replace(problem, samples=problem.samples._replace(outputs=outputs)), start[None])
+def _refits(problem: Problem, drawn, start: Float[Array, " parameter"]):
+    """Refit to drawn outputs `[draw, record, time, signal]` and means of priors `[draw, parameter]`, if there are."""
+
+    def refit(drawn):
+        outputs, known = drawn
+        priors = None if problem.priors is None else problem.priors._replace(mean=known)
+        samples = problem.samples._replace(outputs=outputs)
+        found = refine(replace(problem, samples=samples, priors=priors), start[None])
         return found.individual[0], found.converged[0]
 
-    return lax.map(refit, outputs, batch_size=min(_TOGETHER, len(outputs)))
+    return lax.map(refit, drawn, batch_size=min(_TOGETHER, len(drawn[0])))
 
 
 def _coloured(random: np.random.Generator, noise: ResidualNoise, shape: tuple[int, ...]) -> np.ndarray:

@@ -106,9 +106,12 @@ def of_covariance(white: Spectrum, covariance: Float[np.ndarray, "parameter para
     )
 
 
-def parameter_root(found: Sensitivities) -> Float[np.ndarray, "parameter parameter"]:
-    """Return R with R^T R the information of the free parameters, that of the initial conditions eliminated."""
-    rows, count = found.rows, len(found.names)
+def parameter_root(found: Sensitivities, noise_factor: float = 1.0) -> Float[np.ndarray, "parameter parameter"]:
+    """Return R with R^T R the information of the free parameters, that of the initial conditions eliminated.
+
+    In units of the problem's noise variance, of which the noise has so many times.
+    """
+    rows, count = found.rows_with_known(noise_factor), len(found.names)
     nuisance, parameters = rows[:, count:], rows[:, :count]
     size = np.linalg.norm(nuisance, axis=0)
     basis, triangle = np.linalg.qr(nuisance[:, size > 0] / size[size > 0])

@@ -28,6 +28,8 @@ class Sensitivities(NamedTuple):
         simulated: `[record, time, signal]`, SI.
         jacobian: `[record, time, signal, parameter]` by the unknowns in their units, over the noise's deviation.
         measured: `[record, time, signal]` where there is a sample.
+        known: `[parameter]` each unknown's unit over the standard deviation with which it is known beforehand; 0 where
+            it is not.
 
     """
 
@@ -38,6 +40,11 @@ class Sensitivities(NamedTuple):
     simulated: Float[np.ndarray, "record time signal"]
     jacobian: Float[np.ndarray, "record time signal parameter"]
     measured: Bool[np.ndarray, "record time signal"]
+    known: Float[np.ndarray, " parameter"]
+
+    def rows_with_known(self, noise_factor: float = 1.0) -> Float[np.ndarray, "sample parameter"]:
+        """`rows`, and one for what is known of each unknown beforehand, in noise of so many times the variance."""
+        return np.concatenate([self.rows, noise_factor**0.5 * np.diag(self.known)[self.known > 0.0]])
 
     @property
     def rows(self) -> Float[np.ndarray, "sample parameter"]:
@@ -71,6 +78,7 @@ def sensitivities(problem: Problem, values: Float[np.ndarray, " parameter"]) -> 
         simulated=np.asarray(y),
         jacobian=np.asarray(jacobian) * (scale / width) / deviation,
         measured=np.asarray(problem.samples.measured),
+        known=np.zeros(len(width)) if problem.priors is None else scale / problem.priors.deviation,
     )
 
 

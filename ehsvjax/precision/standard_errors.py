@@ -161,17 +161,20 @@ def covariance_of(
 ) -> tuple[Float[np.ndarray, "parameter parameter"], Bool[np.ndarray, " parameter"]]:
     """Return the covariance of the unknowns, each in its unit, and which of them the record shows apart at all.
 
-    (J^T J)^-1 times the noise's variance; where the noise is coloured the sandwich with J^T Sigma J inside.
+    (J^T J)^-1 times the noise's variance; where the noise is coloured the sandwich with J^T Sigma J inside. What is
+    known of an unknown beforehand is one more reading.
     """
-    bread, seen = bread_of(found)
+    bread, seen = bread_of(found, factor)
     if noises is None or not any(len(noise.coefficients) for noise in noises):
         return factor * bread, seen
-    return factor * bread @ _inside(found, noises) @ bread, seen
+    return factor * bread @ (_inside(found, noises) + factor * np.diag(found.known**2)) @ bread, seen
 
 
-def bread_of(found: Sensitivities) -> tuple[Float[np.ndarray, "parameter parameter"], Bool[np.ndarray, " parameter"]]:
+def bread_of(
+    found: Sensitivities, factor: float
+) -> tuple[Float[np.ndarray, "parameter parameter"], Bool[np.ndarray, " parameter"]]:
     """Return (J^T J)^-1 without the directions that are rounding, and which unknowns take no part in those."""
-    rows = found.rows
+    rows = found.rows_with_known(factor)
     size = np.linalg.norm(rows, axis=0)
     per_size = np.where(size > 0, 1.0 / np.where(size > 0, size, 1.0), 0.0)
     values, vectors = np.linalg.svd(np.linalg.qr(rows * per_size, mode="r"))[1:]
@@ -219,7 +222,7 @@ def _noise(problem: Problem, found: Sensitivities, given: bool, colour: str):
 
 def _with_what_the_fit_took(found: Sensitivities, influence, noises: list[ResidualNoise]) -> list[ResidualNoise]:
     """Return the noises estimated again from autocovariances to which what the fit absorbed is added back."""
-    bread, _ = bread_of(found)
+    bread, _ = bread_of(found, 1.0)
     # Of the inverse of J^T J: J times this root has orthonormal columns.
     scale = np.sqrt(np.maximum(np.diag(bread), 1e-300))
     squares, directions = np.linalg.eigh(bread / scale[:, None] / scale)
@@ -275,7 +278,8 @@ def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:
     """Return what a person wants to know of a fit to first order."""
     found, noises, factor, _, words, covariance, seen = fit
     # Data without any noise leave no residuals, and all directions that show are fixed.
-    directions = spectrum(parameter_root(found) / np.sqrt(max(factor, _LEAST_FACTOR)))
+    factor = max(factor, _LEAST_FACTOR)
+    directions = spectrum(parameter_root(found, factor) / np.sqrt(factor))
     count, names = len(found.names), list(found.names)
     coloured = noises is not None and any(len(noise.coefficients) for noise in noises)
     if coloured:

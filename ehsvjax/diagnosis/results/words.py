@@ -136,6 +136,9 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
             lines.append(
                 f"  the readings lie on a lattice of {m.lattice:.3g}{unit}: {100 * min(share, 1.0):.0f}% of the noise"
             )
+    known = [p.name for p in diagnosis.fit.model.parameters if p.prior]
+    if known:
+        lines.append(f"what was known beforehand, of {', '.join(known)}, was left aside: the records alone were asked")
     if diagnosis.verdict != "adequate" and diagnosis.misfit.tests:
         first = diagnosis.misfit.tests[0]
         repeating = _repeating(first.period, quantity_unit(diagnosis.fit.model, first.quantity))
