@@ -220,13 +220,14 @@ def shown_on(bench: Bench, bank) -> list[Shown]:
     def simulated(values):
         return {what: ehsvjax.simulate(full, record, values)[output] for what, record in records.items()}
 
+    truth = {parameter: bench.model.nominal[parameter] for parameter in bench.model.free}
     without, found = simulated(absent), []
     for candidate in candidates:
         sizes = SIZES[title_of(candidate.effect)]
         with_it = simulated(absent | {candidate.parameter(number): value for number, value in sizes.items()})
         measured = ehsvjax.Record(time, records["record"].inputs, {output: with_it["record"] + noise})
         fit = ehsvjax.identify(
-            bench.model, measured, key=jax.random.key(0), population=30, generations=10, start=bench.model.nominal
+            bench.model, measured, key=jax.random.key(0), population=30, generations=10, start=truth
         )
         found.append(Shown(candidate, bench, with_it, without, fit.residuals(measured)[output], fit))
         print(".", end="", flush=True)
@@ -310,7 +311,7 @@ def page(every: list[Shown]) -> str:
 def main(folder: Path) -> None:
     """Draw everything, and write the page."""
     folder.mkdir(parents=True, exist_ok=True)
-    plt.rcParams.update({"font.size": 8, "axes.titlesize": 8, "svg.fonttype": "path", "axes.spines.top": False,
+    plt.rcParams.update({"font.size": 8, "axes.titlesize": 8, "svg.fonttype": "none", "axes.spines.top": False,
                          "axes.spines.right": False, "figure.facecolor": "white"})  # fmt: skip
     left, every = list(effects.BANK), []
     for bench in benches():

@@ -95,7 +95,7 @@ def test_examples_run(page, bench):
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_code_can_be_read(page):
-    for block in re.findall(r"```(?:python|\{code-cell\})\n(?::.*\n)*(.*?)```", page.read_text(), re.DOTALL):
+    for block in re.findall(r"```(?:python|\{code-cell\})\n(?::[^\n]*\n)*(.*?)```", page.read_text(), re.DOTALL):
         compile(block, name_of(page), "exec")
 
 
