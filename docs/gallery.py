@@ -226,9 +226,7 @@ def shown_on(bench: Bench, bank) -> list[Shown]:
         sizes = SIZES[title_of(candidate.effect)]
         with_it = simulated(absent | {candidate.parameter(number): value for number, value in sizes.items()})
         measured = ehsvjax.Record(time, records["record"].inputs, {output: with_it["record"] + noise})
-        fit = ehsvjax.identify(
-            bench.model, measured, key=jax.random.key(0), population=30, generations=10, start=truth
-        )
+        fit = ehsvjax.identify(bench.model, measured, key=jax.random.key(0), population=30, generations=10, start=truth)
         found.append(Shown(candidate, bench, with_it, without, fit.residuals(measured)[output], fit))
         print(".", end="", flush=True)
     return found
@@ -240,13 +238,12 @@ def draw(shown: Shown, folder: Path, name: str) -> None:
     _, label, scale = bench.shown
     time = bench.period * np.arange(len(shown.left))
     for what in ("step", "sweep", "record"):
-        figure, axes = plt.subplots(
-            2, sharex=True, figsize=(3.6, 2.7), layout="constrained", height_ratios=(3, 2), squeeze=True
-        )
+        figure, axes = plt.subplots(2, sharex=True, figsize=(3.6, 2.7), height_ratios=(3, 2))
+        figure.subplots_adjust(0.17, 0.15, 0.97, 0.92, hspace=0.12)
         part = slice(0, round(bench.step_until / bench.period) if what == "step" else None)
         part = slice(0, part.stop, max(1, (part.stop or len(time)) // DRAWN))
-        axes[0].plot(time[part], scale * shown.without[what][part], WITHOUT, lw=1.6, label="without")
-        axes[0].plot(time[part], scale * shown.with_it[what][part], WITH, lw=1.0, label="with")
+        axes[0].plot(time[part], scale * shown.without[what][part], WITHOUT, lw=1.6)
+        axes[0].plot(time[part], scale * shown.with_it[what][part], WITH, lw=1.0)
         axes[0].set_ylabel(label)
         if what == "record":
             axes[1].axhspan(-2 * scale * bench.noise, 2 * scale * bench.noise, color="0.88")
@@ -271,6 +268,8 @@ def words(shown: Shown) -> list[str]:
     )
     scale, unit = bench.shown[2], bench.shown[1].partition(", ")[2]
     rms = float(np.sqrt(np.mean(shown.left**2)))
+    left = f"{scale * rms:.2g} {unit}".strip() + f" rms, {rms / bench.noise:.2g} times the noise"
+    left = "no more than the noise" if rms < 1.05 * bench.noise else left
     moved = {name: value / bench.model.nominal[name] - 1.0 for name, value in fit.parameters.items()}
     most = sorted((name for name in moved if abs(moved[name]) > 0.01), key=lambda name: -abs(moved[name]))[:3]
     bent = ", ".join(f"`{name}` {100 * moved[name]:+.0f}%" for name in most)
@@ -278,8 +277,7 @@ def words(shown: Shown) -> list[str]:
         f"{effect.says[0].upper()}{effect.says[1:]}.",
         "",
         f"- Shown at `{candidate.signal}` of {bench.said}: {numbers}.",
-        f"- A fit without it leaves {scale * rms:.2g} {unit}".rstrip() + f", {rms / bench.noise:.2g} times the noise"
-        + (f"; its parameters give way: {bent}." if bent else "; no parameter gives way by more than 1%."),
+        f"- A fit without it leaves {left}; " + (f"its parameters give way: {bent}." if bent else "no parameter gives way."),
         f"- What settles it: {effect.settled_by}.",
     ]  # fmt: skip
 
@@ -290,10 +288,11 @@ def page(every: list[Shown]) -> str:
         "# Gallery of effects",
         "",
         "What a model may lack, one by one: what each effect of `ehsvjax.effects.BANK` does to a step and to a sweep, and",
-        "what a fit of the model without it leaves of a record of held levels. The grey band is two standard deviations",
-        "of the noise: what stays within it is not seen. An effect that a fit takes up into its parameters leaves little",
-        "and bends them, which is worse. `diagnose` tries all of them at every signal that takes them; besides these,",
-        "every constant that may have been given wrong, and an input that a sensor shows at once.",
+        "what a fit of the model without it leaves of a record of held levels. Blue is with the effect, grey without; red",
+        "is the difference, and of the record what the fit leaves. The grey band is two standard deviations of the noise:",
+        "what stays within it is not seen. An effect that a fit takes up into its parameters leaves little and bends them,",
+        "which is worse. `diagnose` tries all of them at every signal that takes them; besides these, every constant that",
+        "may have been given wrong, and an input that a sensor shows at once.",
         "",
     ]
     for kind, heading in KINDS.items():
@@ -315,7 +314,9 @@ def main(folder: Path) -> None:
                          "axes.spines.right": False, "figure.facecolor": "white"})  # fmt: skip
     left, every = list(effects.BANK), []
     for bench in benches():
-        kinds = {signal.kind for signal in bench.model.signals} | ({"parameter"} if "oscillator" in bench.said else set())
+        kinds = {signal.kind for signal in bench.model.signals} | (
+            {"parameter"} if "oscillator" in bench.said else set()
+        )
         every += shown_on(bench, tuple(effect for effect in left if effect.kind in kinds))
         left = [effect for effect in left if effect.kind not in kinds]
     assert not left, [effect.name for effect in left]
