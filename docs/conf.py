@@ -18,6 +18,7 @@ html_css_files = ["own.css"]
 html_copy_source = html_show_sourcelink = html_show_copyright = False
 # A name in backticks is code, as in Markdown.
 default_role = "code"
+highlight_language = "none"
 pygments_style = "friendly"
 
 # Notebooks are shown as they were committed; pages that ask for it by themselves are run, and an error ends the build.

@@ -158,6 +158,16 @@ SIZES: dict[str, dict[str, float]] = {
     "parameter_drift": {"drift": 0.2},
 }
 
+SAID = """
+What a model may lack, one by one: what each effect of `ehsvjax.effects.BANK` does to a step and to a sweep, and what a
+fit of the model without it leaves of a record of held levels. Blue is with the effect, grey without; red is the
+difference, and of the record what the fit leaves. The grey band is two standard deviations of the noise: what stays
+within it is not seen. An effect that a fit takes up into its parameters leaves little and bends them, which is worse.
+
+`diagnose` tries all of them at every signal that takes them; besides these, every constant that may have been given
+wrong, and an input that a sensor shows at once.
+"""
+
 # In the order of the page: what each kind of signal is.
 KINDS = {
     "input": "At an input", "drive": "At the drive of the torque motor", "feedback": "At the feedback",
@@ -273,11 +283,12 @@ def words(shown: Shown) -> list[str]:
     moved = {name: value / bench.model.nominal[name] - 1.0 for name, value in fit.parameters.items()}
     most = sorted((name for name in moved if abs(moved[name]) > 0.01), key=lambda name: -abs(moved[name]))[:3]
     bent = ", ".join(f"`{name}` {100 * moved[name]:+.0f}%" for name in most)
+    bent = f"its parameters give way: {bent}" if bent else "no parameter gives way"
     return [
         f"{effect.says[0].upper()}{effect.says[1:]}.",
         "",
         f"- Shown at `{candidate.signal}` of {bench.said}: {numbers}.",
-        f"- A fit without it leaves {left}; " + (f"its parameters give way: {bent}." if bent else "no parameter gives way."),
+        f"- A fit without it leaves {left}; {bent}.",
         f"- What settles it: {effect.settled_by}.",
     ]  # fmt: skip
 
@@ -286,14 +297,7 @@ def page(every: list[Shown]) -> str:
     """Return the page, by kind of signal."""
     lines = [
         "# Gallery of effects",
-        "",
-        "What a model may lack, one by one: what each effect of `ehsvjax.effects.BANK` does to a step and to a sweep, and",
-        "what a fit of the model without it leaves of a record of held levels. Blue is with the effect, grey without; red",
-        "is the difference, and of the record what the fit leaves. The grey band is two standard deviations of the noise:",
-        "what stays within it is not seen. An effect that a fit takes up into its parameters leaves little and bends them,",
-        "which is worse. `diagnose` tries all of them at every signal that takes them; besides these, every constant that",
-        "may have been given wrong, and an input that a sensor shows at once.",
-        "",
+        SAID,
     ]
     for kind, heading in KINDS.items():
         lines += [f"## {heading}", ""]

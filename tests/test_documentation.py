@@ -1,4 +1,4 @@
-"""The pages in `docs/`: every public name is in one of them, every example of the reference runs, every link leads on."""
+"""The pages in `docs/`: each public name on one of them, each example of the reference runs, each link leads on."""
 
 import doctest
 import importlib
