@@ -2,6 +2,7 @@
 
 import doctest
 import importlib
+import importlib.util
 import inspect
 import re
 from collections import Counter
@@ -131,3 +132,13 @@ def contents_of(page):
     """Entries of a page's tables of contents."""
     tables = re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(), re.DOTALL)
     return [line for table in tables for line in table.splitlines() if line and not line.startswith(":")]
+
+
+def test_every_effect_of_the_bank_is_in_the_gallery():
+    source = importlib.util.spec_from_file_location("gallery", ROOT / "docs" / "gallery.py")
+    gallery = importlib.util.module_from_spec(source)
+    source.loader.exec_module(gallery)
+    for effect in ehsvjax.effects.BANK:
+        assert set(gallery.SIZES[gallery.title_of(effect)]) == {number.name for number in effect.parameters}
+        assert effect.kind in gallery.KINDS
+    assert len(gallery.SIZES) == len({gallery.title_of(effect) for effect in ehsvjax.effects.BANK})
