@@ -2,8 +2,10 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+# What the tests and the notebooks have compiled need not be compiled again.
+CACHED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-.PHONY: demo test lint types notebooks benchmarks clean
+.PHONY: demo test lint types notebooks docs benchmarks clean
 
 demo: $(VENV)/installed
 	$(BIN)/python -m ehsvjax --out out
@@ -20,6 +22,16 @@ types: $(VENV)/installed-develop
 
 notebooks: $(VENV)/installed-develop
 	$(BIN)/python notebooks/run_all.py
+
+# Pages that open from a folder, build/docs/index.html; what they are made of is put together in build/pages.
+docs: $(VENV)/installed-docs
+	rm -rf build/pages build/docs
+	mkdir -p build
+	cp -r docs build/pages
+	cp notebooks/*.ipynb notebooks/*.png build/pages/notebooks
+	cp CHANGELOG.md build/pages/changes.md
+	$(CACHED) $(BIN)/python docs/gallery.py build/pages/gallery
+	$(CACHED) $(BIN)/python -m sphinx -W --keep-going -q -d build/doctrees build/pages build/docs
 
 # What the fits are worth, then how fast they are. Speed wants a quiet machine.
 benchmarks: $(VENV)/installed-benchmark
@@ -49,6 +61,10 @@ $(VENV)/installed-test: pyproject.toml constraints.txt | $(VENV)/bin/python
 
 $(VENV)/installed-develop: pyproject.toml constraints.txt | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[develop]"
+	touch $@
+
+$(VENV)/installed-docs: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@
 
 $(VENV)/installed-benchmark: pyproject.toml constraints.txt | $(VENV)/bin/python
