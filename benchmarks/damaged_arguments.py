@@ -68,6 +68,34 @@ def values_of(name: str) -> dict:
     }
 
 
+def priors_of(name: str) -> dict:
+    """Return wrong values for a mapping from names to means and standard deviations."""
+    return MAPPING | {
+        "unknown name": {"nobody": (1.0, 1.0)},
+        "one number": {name: 1.0},
+        "three numbers": {name: (1.0, 2.0, 3.0)},
+        "texts in it": {name: ("1", "2")},
+        "NaN in it": {name: (NAN, 2.0)},
+        "negative": {name: (1.0, -1.0)},
+        "no deviation": {name: (1.0, 0.0)},
+        "inf in it": {name: (1.0, INF)},
+    }
+
+
+def ties_of(name: str) -> dict:
+    """Return wrong values for a mapping from names to functions of all parameters."""
+    return MAPPING | {
+        "unknown name": {"nobody": lambda p: 1.0},
+        "a number in it": {name: 2.0},
+        "takes nothing": {name: lambda: 1.0},
+        "gives a list": {name: lambda p: [1.0, 2.0]},
+        "gives a text": {name: lambda p: "1"},
+        "gives NaN": {name: lambda p: NAN},
+        "of what is not there": {name: lambda p: p["nobody"]},
+        "divides by zero": {name: lambda p: 1.0 / 0.0},
+    }
+
+
 def bounds_of(name: str) -> dict:
     """Return wrong values for a mapping from names to bounds."""
     return MAPPING | {

@@ -28,6 +28,8 @@ from benchmarks.damaged_arguments import (
     TIME,
     WHOLE,
     bounds_of,
+    priors_of,
+    ties_of,
     values_of,
     without,
 )
@@ -102,6 +104,8 @@ def of_fits() -> Iterator[Call]:
         "population": (4, WHOLE), "generations": (1, WHOLE), "bounds": ({"gain": (1.0, 3.0)}, bounds_of("gain")),
         "fixed": ({"lag": 1.0}, values_of("lag")), "initial": ("estimate", initial), "refine": (False, FLAG),
         "start": ({"gain": 2.0}, values_of("gain") | {"outside": {"gain": 99.0}}),
+        "priors": ({"gain": (2.0, 0.5)}, priors_of("gain")),
+        "tied": (None, ties_of("gain")),
         "noise_variance": ({"level": 1e-4}, variances), "huber": (1.5, without(POSITIVE, "None")),
         "operators": (ehsvjax.Operators(), THING), "tolerance": (0.01, NOT_NEGATIVE), "starts": (1, WHOLE),
         "islands": (1, WHOLE), "devices": (None, without(THING, "None")), "progress": (False, FLAG),
