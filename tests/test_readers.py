@@ -12,7 +12,7 @@ import pytest
 from ehsvjax import Column, Record, files
 from ehsvjax.clock import seconds_of
 from ehsvjax.files import reading
-from tests.test_columns import PLAIN, RAW, WANTED, check, refusal, unchecked  # noqa: F401
+from tests.test_columns import PLAIN, RAW, WANTED, check, refusal
 
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("openpyxl")
@@ -248,7 +248,7 @@ READERS = [Record.from_csv, Record.from_npz, Record.from_mat, Record.from_excel,
 
 
 @pytest.mark.parametrize("read", READERS)
-def test_no_file_a_folder_and_no_path(read, tmp_path, unchecked):  # noqa: F811
+def test_no_file_a_folder_and_no_path(read, tmp_path, unchecked):
     sentence = refusal(read, tmp_path / "nowhere", **PLAIN, kind=FileNotFoundError)
     assert sentence.startswith(f"{tmp_path / 'nowhere'} cannot be opened (no such file or directory): check its name")
     assert "(is a directory)" in refusal(read, tmp_path, **PLAIN, kind=IsADirectoryError)

@@ -10,7 +10,6 @@ import pytest
 
 import ehsvjax
 from ehsvjax import Column, Record
-from tests.test_columns import unchecked  # noqa: F401
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 OWN = Path(ehsvjax.__file__).parent
