@@ -125,7 +125,7 @@ class Fit:
         """Names of the outputs that were fitted."""
         return tuple(self.noise_variance)
 
-    @property
+    @functools.cached_property
     def tied(self) -> dict[str, float]:
         """Name -> value of each parameter that follows others, SI."""
         return tied_values(self.model.ties, self.model.nominal | self.parameters)

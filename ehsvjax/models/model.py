@@ -405,14 +405,13 @@ def as_prior(name: str, prior: Any) -> tuple[float, float]:
         ValueError: if it is no pair of a mean and a positive standard deviation.
 
     """
-    given = map(as_number, prior) if isinstance(prior, tuple | list | np.ndarray) else ()
-    pair = [value for value in given if value is not None and np.isfinite(value)]
-    if len(pair) != 2 or len(prior) != 2 or pair[1] <= 0.0:
+    pair = _two_numbers(prior)
+    if pair is None or not np.isfinite(pair).all() or pair[1] <= 0.0:
         raise ValueError(
             f"expected the prior of {name} as (mean, standard deviation), the latter positive, got {prior!r}: give two "
             "numbers, SI"
         )
-    return pair[0], pair[1]
+    return pair
 
 
 def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
@@ -422,11 +421,18 @@ def as_bounds(name: str, bounds: Any) -> tuple[float, float]:
         ValueError: if they are no such pair.
 
     """
-    given = map(as_number, bounds) if isinstance(bounds, tuple | list | np.ndarray) else ()
-    pair = [bound for bound in given if bound is not None]
-    if len(pair) != 2 or len(bounds) != 2:
+    pair = _two_numbers(bounds)
+    if pair is None:
         raise ValueError(f"expected bounds of {name} as (lower, upper), got {bounds!r}: give two numbers, SI")
-    return pair[0], pair[1]
+    return pair
+
+
+def _two_numbers(values: Any) -> tuple[float, float] | None:
+    """Return a pair of numbers as one, None if it is none."""
+    if not isinstance(values, tuple | list | np.ndarray) or len(values) != 2:
+        return None
+    first, second = map(as_number, values)
+    return None if first is None or second is None else (first, second)
 
 
 def check_kind(name: str, kind: str, known: Collection[str]) -> None:

@@ -19,9 +19,9 @@ MAKERS: dict[str, Callable[..., Model]] = {"servovalve": servovalve, "van_der_po
 def describe_model(model: Model, encoded: Callable[[Any], Any]) -> dict[str, Any]:
     """Return all that a model says but its equations, and what made those; `encoded` gives JSON forms of values."""
     maker = _maker_of(model)
-    numbers = {name: value for name, value in _fields_of(model).items() if name not in Equations._fields}
-    # What a parameter is tied by is code.
-    del numbers["ties"]
+    # Equations are code, and so is what a parameter is tied by.
+    code = (*Equations._fields, "ties")
+    numbers = {name: value for name, value in _fields_of(model).items() if name not in code}
     if maker is None:
         # How a user's model was made is the user's own.
         del numbers["options"]

@@ -148,7 +148,7 @@ class Workbench:
             some = points[first : first + _ABREAST]
             added: Any = self._always_added
             if disturbances is not None:
-                added = np.repeat(self.disturbances[None], _ABREAST, axis=0)
+                added = np.array(added)
                 added[: len(some)] += disturbances[first : first + _ABREAST]
             # The setting is that of a thread.
             with jax.enable_x64(True):
