@@ -1,11 +1,11 @@
 """Does a diagnosis find what was hidden? Many records of independent plants, each with effects drawn at random.
 
-    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--unknown 60] [--kind all]
+    python benchmarks/diagnosis.py [--draws 2] [--nulls 250] [--pairs 60] [--triples 40] [--unknown 60] [--kind all]
                                    [--model all] [--seed 0]
 
 The plants are those of tests/hidden_plants.py, which share nothing with the package. Hidden are: one effect of each
-kind at three noise levels; two effects together; nothing, under white, correlated, quantised noise and outliers; and an
-effect that the bank does not have. Of effects the plant also says what could be known: the noise variances by which the
+kind at three noise levels; two or three together; nothing, under white, correlated, quantised noise and outliers; and
+an effect that the bank lacks. Of effects the plant also says what could be known: the noise variances by which the
 best rival would fit worse, the nominal parameters refitted, to first order for the servovalve. Draws are shared out to
 processes, one on each core; each trial can be repeated from its seed.
 """
@@ -65,6 +65,9 @@ def trials_of(options) -> list[Trial]:
         for i in range(options.pairs // 2):
             pair = tuple(rng.choice(known, 2, replace=False).tolist())
             found.append(Trial("two", Hidden(model, "white", variances[i % 2], pair, seed())))
+        for i in range(options.triples // 2):
+            three = tuple(rng.choice(known, 3, replace=False).tolist())
+            found.append(Trial("three", Hidden(model, "white", variances[i % 2], three, seed())))
         for i in range(options.unknown // 2):
             found.append(Trial("unknown", Hidden(model, "white", variances[0], (unknown[i % len(unknown)],), seed())))
     return [t for t in found if options.kind in ("all", t.kind) and options.model in ("all", t.hidden.model)]
@@ -84,7 +87,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         if trial.kind != "none" and "process_noise" not in hidden.names:
             known = oracle(hidden, one)
             row |= {"worth": known.worth, "rival_deficit": known.deficit, "rival": known.rival}
-        if trial.kind == "two":
+        if trial.kind in ("two", "three"):
             row["worth_each"] = worth_each(hidden, one)
         key = jax.random.key(hidden.seed)
         began = time.perf_counter()
@@ -145,7 +148,7 @@ def base(cause: str) -> str:
 
 
 def outcome(row) -> str:
-    """Judge one trial of one or two effects, or of none."""
+    """Judge one trial of up to three effects, or of none."""
     truth = set(row["names"])
     if row["kind"] == "unknown" and row["verdict"] not in ("failed", "unexplained"):
         return "explained away" if row["innocent"] else "residual not innocent"
@@ -181,15 +184,15 @@ def summary(table: pd.DataFrame) -> list[str]:
             share, error = 100 * np.mean(every), 100 * np.sqrt(0.95 * 0.05 / len(every))
             lines.append(f"parameters within their 95% intervals where the effect was named: {share:.1f}% "
                          f"of {len(every)} (sampling error {error:.1f})")  # fmt: skip
-    for kind in ("none", "two", "unknown"):
+    for kind in ("none", "two", "three", "unknown"):
         some = table[table["kind"] == kind]
         if len(some):
             lines.append(f"{kind}: {counts(some)}")
-            if kind == "two":
+            if kind in ("two", "three"):
                 each = np.array([worths is not None and min(worths) > SEPARABLE for worths in some["worth_each"]])
                 seen = some[each & (some["rival_deficit"] > SEPARABLE)]
-                lines.append(f"    both worth more than {SEPARABLE:g} beside the other, and any one effect worse by as "
-                             f"much: {counts(seen)}")  # fmt: skip
+                lines.append(f"    each worth more than {SEPARABLE:g} beside the others, any fewer worse by as much: "
+                             f"{counts(seen)}")  # fmt: skip
             if kind == "unknown":
                 clear = some[some["rival_deficit"] > SEPARABLE]
                 lines.append(f"    best two of the bank worse by more than {SEPARABLE:g}: {counts(clear)}")
@@ -248,8 +251,9 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=2, help="of every effect at every noise level")
     parser.add_argument("--nulls", type=int, default=250, help="records of each model without any effect")
     parser.add_argument("--pairs", type=int, default=60, help="records with two effects")
+    parser.add_argument("--triples", type=int, default=40, help="records with three effects")
     parser.add_argument("--unknown", type=int, default=60, help="records with an effect that the bank lacks")
-    parser.add_argument("--kind", choices=["all", "one", "none", "two", "unknown"], default="all")
+    parser.add_argument("--kind", choices=["all", "one", "none", "two", "three", "unknown"], default="all")
     parser.add_argument("--model", choices=["all", *VARIANCES], default="all")
     parser.add_argument("--seed", type=int, default=0, help="of all trials")
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax import kernels
 from ehsvjax.population import Problem, cast, simulated
 
 # Noise variances that the arithmetic of one simulation may be worth: what it adds to the difference of two sums of
@@ -62,7 +63,7 @@ def outputs_of(
         return np.asarray(_outputs(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
 
 
-_outputs = jax.jit(simulated)
+_outputs = kernels.jit(simulated)
 
 
 def settled_at(problem: Problem, individual: Float[np.ndarray, " parameter"], left_out: float = LEFT_OUT) -> Problem:

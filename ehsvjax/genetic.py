@@ -3,18 +3,16 @@
 It searches the unit cube; what the coordinates and the cost mean is not known here.
 """
 
-import functools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ehsvjax import draws
+from ehsvjax import draws, kernels
 from ehsvjax.checks import function, number, whole
 from ehsvjax.operators import (
     Crossover,
@@ -103,7 +101,7 @@ class History(NamedTuple):
     best: Float[Array, "generation parameter"]
 
 
-@functools.partial(jax.jit, static_argnames=("population", "unknowns", "generations", "elites", "dtype"))
+@kernels.jit(static_argnames=("population", "unknowns", "generations", "elites", "dtype"))
 def init(
     key: Key[Array, ""], population: int, unknowns: int, generations: int, elites: int, dtype=jnp.float32
 ) -> tuple[State, History]:
@@ -168,7 +166,7 @@ def generation(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("operators",))
+@kernels.jit(static_argnames=("operators",))
 def run(
     cost: Callable,
     operators: Operators,

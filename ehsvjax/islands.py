@@ -15,14 +15,14 @@ from jax import lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Int, Key
 
-from ehsvjax import genetic
+from ehsvjax import genetic, kernels
 from ehsvjax.genetic import History, Operators, State
 
 MIGRATION_INTERVAL = 5
 """Generations from one migration to the next."""
 
 
-@functools.partial(jax.jit, static_argnames=("islands", "population", "unknowns", "generations", "elites"))
+@kernels.jit(static_argnames=("islands", "population", "unknowns", "generations", "elites"))
 def init(
     key: Key[Array, ""], islands: int, population: int, unknowns: int, generations: int, elites: int
 ) -> tuple[State, History]:
@@ -33,7 +33,7 @@ def init(
     return states, jax.tree.map(lambda leaf: leaf[0], histories)
 
 
-@functools.partial(jax.jit, static_argnames=("operators", "devices"))
+@kernels.jit(static_argnames=("operators", "devices"))
 def run(
     cost: Callable,
     operators: Operators,

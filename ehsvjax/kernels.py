@@ -8,6 +8,8 @@ package's own loops alone and without a compiler flag:
   itself with loops that touch less than 1 kB (its SmallWhileLoopHoistingPass leaves the same mark).
 - `stored_once` cuts a step at the values that several of its results need, and has each computed and stored once.
 
+- `jit` has XLA compile a program in two thirds of the time.
+
 Measured for 1,024 individuals on one core with AVX2, ns per individual and integration step: servovalve 23 as XLA
 compiles it by default, 11 in one kernel, 3.5 with shared values stored too; Van der Pol 5.8, 1.4 and 0.9.
 
@@ -25,6 +27,9 @@ from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array, Float
+
+# Known to the XLA of these versions of JAX; another would refuse an option that it does not know.
+_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else None
 
 # What recomputing a value may cost before it is stored, in operations: a store and its loads take about as long.
 _WORTH_STORING = 8
@@ -56,6 +61,31 @@ _CALLS = frozenset(("closed_call", "jit"))
 _DEAR = {"div": 6, "sqrt": 8, "rsqrt": 8, "cond": 30} | dict.fromkeys(
     ("atan2", "cbrt", "cos", "erf", "exp", "expm1", "log", "log1p", "logistic", "pow", "sin", "tan", "tanh"), 20
 )
+
+
+def jit(function: Callable | None = None, **static) -> Callable:
+    """Return the function as `jax.jit` compiles it, but sooner: XLA's older way to fuse operations makes the same code.
+
+    Measured: the search of a servovalve 1.2 s instead of 1.6, its refinement 1.7 instead of 2.6, a bench of all effects
+    4.6 instead of 6.1; they take the same time to run and give the same bits. It is an option of a whole program:
+    called within another, the function is compiled as that one is.
+
+    Args:
+        function: to be compiled; none: a decorator is returned.
+        static: `static_argnames` or `static_argnums`, as of `jax.jit`.
+
+    """
+    if function is None:
+        return functools.partial(jit, **static)
+    alone, within = jax.jit(function, compiler_options=_OPTIONS, **static), jax.jit(function, **static)
+
+    @functools.wraps(function)
+    def called(*args, **kwargs):
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
+        return (within if traced else alone)(*args, **kwargs)
+
+    called.lower = alone.lower  # type: ignore[attr-defined]
+    return called
 
 
 def one_kernel(function: Callable) -> Callable:

@@ -10,6 +10,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ehsvjax import kernels
 from ehsvjax.checks import number, positive, refused, whole
 from ehsvjax.population import Problem, huber_weight, population_cost, prior_residuals, residuals, robust_square
 
@@ -119,7 +120,7 @@ def gauss_newton_step(
     return -scale * (vectors @ (inverse * (vectors.T @ (scale * gradient))))
 
 
-@functools.partial(jax.jit, static_argnames=("optimizer", "iterations"))
+@kernels.jit(static_argnames=("optimizer", "iterations"))
 def refine(
     problem: Problem,
     starts: Float[Array, "individual parameter"],

@@ -12,6 +12,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ehsvjax import kernels
 from ehsvjax.checks import by_name, function, instance, number, whole
 from ehsvjax.holds import HOLDS, between, course
 from ehsvjax.integrators import repeated, scan_samples
@@ -234,7 +235,7 @@ def _is_count(leaf) -> bool:
     return isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jnp.integer)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@kernels.jit(static_argnums=(0, 1, 2))
 def _simulate(equations, grid, signal, parameters, initial, inputs, sample_period, holds):
     def keep(carry, outputs, sample):
         return carry, outputs

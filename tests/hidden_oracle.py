@@ -56,7 +56,7 @@ class Oracle(NamedTuple):
         worth: of it beside a refit of what is known.
         deficit: by which the best rival is worse; 0 for a rival that makes the same record. Where one is not worse by
             `SEPARABLE`, others are not asked any further.
-        rival: that rival: one other effect, for two effects together any one; for an effect that is in no bank two.
+        rival: that rival: one other effect; for several together any of one less, for one that is in no bank any two.
 
     """
 
@@ -66,7 +66,7 @@ class Oracle(NamedTuple):
 
 
 def oracle(hidden: Hidden, made: Made) -> Oracle:
-    """Return what could be known of the effects that a record hides: one or two, or one that is in no bank."""
+    """Return what could be known of the effects that a record hides: up to three, or one that is in no bank."""
     left = _left_by_nothing(hidden, made)
     size = float(left @ left) / hidden.variance
     unit = left / max(np.linalg.norm(left), 1e-300)
@@ -77,7 +77,7 @@ def oracle(hidden: Hidden, made: Made) -> Oracle:
         if name in EXACTLY_ALIKE[hidden.model]:
             return Oracle(size, 0.0, EXACTLY_ALIKE[hidden.model][name])
     every = library(hidden.model, made.excitation, len(made.time))
-    if hidden.names[0].startswith("unknown"):
+    if hidden.names[0].startswith("unknown") or len(hidden.names) == 3:
         rivals = {names: _together(unit, names, every) for names in combinations(every, 2)}
     else:
         rivals = {(name,): _alone(unit, name, every) for name in every if hidden.names != (name,)}

@@ -58,6 +58,24 @@ def _assert_close(actual, expected):
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=2e-6, atol=1e-5), actual, expected)
 
 
+def test_a_compiled_program_may_be_part_of_another():
+    @kernels.jit(static_argnames=("power",))
+    def scaled(x, power=2):
+        return 3.0 * x**power
+
+    x = jnp.arange(3.0)
+    np.testing.assert_allclose(scaled(x), [0.0, 3.0, 12.0])
+    np.testing.assert_allclose(jax.jit(lambda x: 1.0 + scaled(x, power=3))(x), [1.0, 4.0, 25.0])
+    np.testing.assert_allclose(jax.vmap(jax.grad(scaled))(x), [0.0, 6.0, 12.0])
+    np.testing.assert_allclose(scaled.lower(x).compile()(x), [0.0, 3.0, 12.0])
+
+
+@pytest.mark.parametrize("function", [_shared, _branches, _tables, _solved])
+def test_a_program_that_is_compiled_sooner_gives_the_same(function):
+    x, y = jnp.float32(0.7), jnp.float32(-1.3)
+    _assert_close(kernels.jit(function)(x, y), jax.jit(function)(x, y))
+
+
 @pytest.mark.parametrize("wrapper", WRAPPERS.values(), ids=WRAPPERS)
 @EVERY_FUNCTION
 def test_values_and_derivatives_are_those_of_the_function_itself(function, wrapper):

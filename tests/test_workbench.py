@@ -13,13 +13,14 @@ from benchmarks.real_models import damper
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
-from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
+from ehsvjax.diagnosis.bench.workbench import prepared, settled
 from ehsvjax.diagnosis.decision.search import _look, _weighed
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
 from ehsvjax.diagnosis.hypotheses.screening import Screened
 from ehsvjax.effects import BANK
 from ehsvjax.population import cast, simulated
+from tests.compilations import compilations
 
 # One process compiles; records are as long as those of test_diagnose.py.
 pytestmark = pytest.mark.xdist_group("diagnoses of the oscillator")
@@ -119,9 +120,9 @@ def valve_fitted(max_step):
 def test_another_step_is_no_other_program():
     before = [workbench(*valve_fitted(max_step), BANK) for max_step in (1e-4, 2.5e-4)]
     before[0].simulated(before[0].nominal[None])
-    compiled = _simulated._cache_size()
-    before[1].simulated(before[1].nominal[None])
-    assert _simulated._cache_size() == compiled
+    with compilations() as compiled:
+        before[1].simulated(before[1].nominal[None])
+    assert compiled == []
 
 
 @pytest.mark.parametrize("place", ["force", "position"])

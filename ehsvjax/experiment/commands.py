@@ -8,6 +8,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ehsvjax import kernels
+
 KINDS = ("held levels", "two levels", "staircase", "triangles", "multisine", "steps with rest")
 OWN = "your own signal"
 _LEVELS = 12
@@ -155,7 +157,7 @@ def realised(genes: Float[np.ndarray, " gene"], time, reach: Reach) -> Float[np.
         return np.asarray(_command(*jax.tree.map(jnp.float64, (genes, time, reach))))
 
 
-_command = jax.jit(command)
+_command = kernels.jit(command)
 
 
 def of_own_size(reach: Reach) -> tuple[float, float]:

@@ -1,13 +1,12 @@
 """Where a model rests, or moves on steadily, while its inputs are constant."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import numpy as np
 from jax import lax
 
+from ehsvjax import kernels
 from ehsvjax.linear.state import as_vector, state_names
 from ehsvjax.linear.steps import first_order
 from ehsvjax.models.model import Equations, Model, identity
@@ -58,7 +57,7 @@ def _in_words(inputs) -> str:
     return ", ".join(f"{name} = {float(value):.6g}" for name, value in inputs.items()) or "none"
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@kernels.jit(static_argnums=0)
 def _after(equations: Equations, values, state, inputs, step_size, steps):
     """Return the state some steps later, under constant inputs."""
     step = equations.stepper(values, step_size, identity)

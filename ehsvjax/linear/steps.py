@@ -1,6 +1,5 @@
 """One step of a model to first order."""
 
-import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax import kernels
 from ehsvjax.linear.state import as_vector
 from ehsvjax.models.model import Equations
 
@@ -55,7 +55,7 @@ def first_order(
     return Step(*(np.asarray(leaf) for leaf in found))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
+@kernels.jit(static_argnums=(0, 1, 2))
 def _first_order(equations: Equations, seen, acting, values, state, u, step_size):
     x, whole = as_vector(state)
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
+from ehsvjax import kernels
 from ehsvjax.checks import choice, fits_memory, whole
 from ehsvjax.draws import check_key
 from ehsvjax.population import Problem, cast, to_unit, to_values
@@ -131,7 +132,7 @@ def bootstrap(
     )
 
 
-@jax.jit
+@kernels.jit
 def _refits(problem: Problem, drawn, start: Float[Array, " parameter"]):
     """Refit to drawn outputs `[draw, record, time, signal]` and means of priors `[draw, parameter]`, if there are."""
 

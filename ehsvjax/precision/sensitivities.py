@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax import kernels
 from ehsvjax.population import Coordinates, Problem, cast, simulated
 
 ROUNDING = 1e-8
@@ -108,7 +109,7 @@ def check_finite(problem: Problem, found: Sensitivities) -> None:
     )
 
 
-@jax.jit
+@kernels.jit
 def _simulated_and_jacobian(problem: Problem, point):
     def twice(point):
         y = simulated(problem, point)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ehsvjax import arithmetic
+from ehsvjax import arithmetic, kernels
 from ehsvjax.effects.effect import Candidate, EffectParameter, Scales, constant_of
 from ehsvjax.effects.extended import effects_at, switch
 from ehsvjax.effects.internal import Internal
@@ -284,6 +284,6 @@ def _disturbed(problem: Problem, point, added) -> Float[Array, "record time sign
     return simulated(replace(problem, samples=problem.samples._replace(inputs=inputs)), point)
 
 
-@jax.jit
+@kernels.jit
 def _simulated(problem: Problem, points, added):
     return jax.vmap(functools.partial(_disturbed, problem))(points, added)
