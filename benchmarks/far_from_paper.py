@@ -27,7 +27,15 @@ import ehsvjax
 from benchmarks.processes import rows_of, said
 from benchmarks.several_outputs import outcome
 from ehsvjax.diagnosis import diagnose
-from tests.hidden_plants import EFFECTS, Valve, effect_sizes, held_levels, servovalve_with, van_der_pol_with
+from tests.hidden_plants import (
+    EFFECTS,
+    VAN_DER_POL_STEP,
+    Valve,
+    effect_sizes,
+    held_levels,
+    servovalve_with,
+    van_der_pol_with,
+)
 from tests.hidden_records import ONE_SIDED, TRUTH
 
 # Noise of the position, of its deviation.
@@ -35,6 +43,8 @@ NOISE = 1e-3
 MOST_SAMPLES, LEAST_SAMPLES = 6000, 1200
 # Of the plant; it steps a stiff load without harm.
 MOST_STEPS = 40_000
+# Deviations of the noise to which a plant is known by its own steps.
+KNOWN_TO = 0.1
 # Deviations of the noise by which an effect moves the position, least and most.
 MOVED = (1.0, 10.0)
 # A constant is given as it is; what is identified is known to a factor.
@@ -76,7 +86,10 @@ def trials_of(options) -> list[Trial]:
 
 @functools.cache
 def rig_of(model: str, seed: int) -> Rig:
-    """Draw a plant whose output moves as a fit needs it: neither stuck in its dead zone nor at rest."""
+    """Draw a plant whose output moves as a fit needs it: neither stuck in its dead zone nor at rest.
+
+    And one that its own steps know: a loop that is not stable goes round and round, and drifts off with every error.
+    """
     rng = np.random.default_rng([3, seed])
     while True:
         rig = _drawn(model, rng)
@@ -89,7 +102,10 @@ def rig_of(model: str, seed: int) -> Rig:
         size = np.std(position[0])
         moving = np.std(position[0, position.shape[1] // 2 :]) > 0.2 * size > 0.0
         moved = np.sqrt(np.mean((position[1:] - position[0]) ** 2, axis=1))
-        if np.isfinite(position).all() and moving and (moved > NOISE * size).all():
+        if not (np.isfinite(position).all() and moving and (moved > NOISE * size).all()):
+            continue
+        off = positions(model, rig, [{}], finer=2)[0] - position[0]
+        if np.sqrt(np.mean(off**2)) < KNOWN_TO * NOISE * size:
             return rig
 
 
@@ -131,15 +147,17 @@ def _excitation(kind: str, rng, samples: int) -> np.ndarray:
     return np.repeat((waves / np.max(np.abs(waves)))[::5], 5)[:samples]
 
 
-def positions(model: str, rig: Rig, effects) -> np.ndarray:
-    """Return the positions [record, time] of a plant with some effects each."""
+def positions(model: str, rig: Rig, effects, finer: int = 1) -> np.ndarray:
+    """Return the positions [record, time] of a plant with some effects each, in steps that are so many times finer."""
     commands = np.tile(rig.command, (len(effects), 1))
     if model == "servovalve":
         duration = rig.period * len(rig.command)
         fine = max(min(1e-4, float(0.03 / np.max(rig.parameters["natural_frequency"]))), duration / MOST_STEPS)
         with np.errstate(all="ignore"):
-            return servovalve_with(effects, commands, rig.period, fine_step=fine, **rig.parameters)["position"]
-    return van_der_pol_with(effects, commands, rig.period, **rig.parameters)["position"]
+            return servovalve_with(effects, commands, rig.period, fine_step=fine / finer, **rig.parameters)["position"]
+    return van_der_pol_with(effects, commands, rig.period, **rig.parameters, fine_step=VAN_DER_POL_STEP / finer)[
+        "position"
+    ]
 
 
 def sizes_of(trial: Trial, rig: Rig, plain: np.ndarray) -> dict[str, float]:

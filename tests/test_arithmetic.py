@@ -201,6 +201,14 @@ def test_what_is_known_is_off_by_less_than_it_is_said_to_be_worth(errors, order)
     assert left_out.size <= 0.05 * 40 and not (off.size and left_out.size and left_out.min() < off.max() - 1e-12)
 
 
+def test_what_no_step_settles_is_not_stepped_finer_by_the_next_who_tries():
+    # A fit hands on the step at which it gave up, and a diagnosis begins there.
+    errors = erring(np.full(40, 1e6), 0.25)
+    once = settled(alone(), errors, ONE)
+    again = replace(once, grid=once.grid._replace(substeps=int(once.substeps)))
+    assert finest(once) and settled(again, errors, ONE).substeps == once.substeps
+
+
 @settings(max_examples=60, deadline=None)
 @given(errors=ERRORS, order=ORDERS)
 def test_what_is_settled_stays_so(errors, order):
