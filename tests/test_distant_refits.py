@@ -7,7 +7,7 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import plain_noise
-from ehsvjax.diagnosis.bench.refits import bounds_of, padded, refit
+from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen
@@ -52,7 +52,7 @@ def led(starved):
     screened = names["supply_pressure"]
     (column,) = bench.columns_of(bench.candidates[screened.candidate])
     starts = np.repeat(screened.start[None], len(SHARES), axis=0)
-    starts[:, column] = np.clip(np.array(SHARES) * screened.start[column], *(b[column] for b in bounds_of(bench)))
+    starts[:, column] = np.clip(np.array(SHARES) * screened.start[column], *(b[column] for b in bench.bounds))
     columns = padded([bench.columns_with((screened.candidate,))] * len(starts), most_unknowns(bench))
     return current, refit(bench, starts, columns, noise, race=False), column
 
@@ -76,7 +76,7 @@ def test_the_supply_pressure_is_that_of_the_plant(led, starved):
 def test_no_unknown_leaves_its_bounds_on_the_way(led, starved):
     _, found, _ = led
     own = found.chosen[0][found.chosen[0] >= 0]
-    lower, upper = (bound[own] for bound in bounds_of(starved))
+    lower, upper = (bound[own] for bound in starved.bounds)
     assert np.all(found.points[:, own] >= lower) and np.all(found.points[:, own] <= upper)
 
 

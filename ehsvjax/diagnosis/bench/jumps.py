@@ -12,7 +12,7 @@ import numpy as np
 
 from ehsvjax.arithmetic import LEFT_OUT, few
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.refits import Refits, bounds_of
+from ehsvjax.diagnosis.bench.refits import Refits
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.readings import standing_out
 
@@ -44,7 +44,7 @@ def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
     # Along each principal direction.
     errors = _ERRORS * vectors[:, kept] / values[kept] / norms[seen, None]
     moved = columns[seen]
-    lower, upper = bounds_of(bench)
+    lower, upper = bench.bounds
     points = np.repeat(point[None], 1 + 2 * errors.shape[1], axis=0)
     points[1:, moved] = np.clip(point[moved] + np.concatenate([errors.T, -errors.T]), lower[moved], upper[moved])
     outputs = bench.simulated(points)

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Int
 
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
-from ehsvjax.effects.effect import UNLIMITED
 
 _ITERATIONS = 60
 # A start is given up if so many steps like the next would not bring it to the best, so many times in a row: a kink
@@ -80,19 +79,6 @@ def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual 
     return np.array([list(c) + [-1] * (width - len(c)) for c in columns])
 
 
-def bounds_of(bench: Workbench) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " parameter"]]:
-    """Return the least and the largest coordinate of every unknown."""
-    lower, upper = np.zeros(len(bench.nominal)), np.ones(len(bench.nominal))
-    for candidate in bench.candidates:
-        scales = bench.scales[candidate.name]
-        for number, j in bench.unknowns_of(candidate):
-            unit = bench.problem.coordinates.upper[j]
-            low, high = number.lower(scales), number.upper(scales)
-            lower[j] = -np.inf if low <= -UNLIMITED else low / unit
-            upper[j] = np.inf if high >= UNLIMITED else high / unit
-    return lower, upper
-
-
 def refit(
     bench: Workbench,
     starts: Float[np.ndarray, "individual parameter"],
@@ -116,7 +102,7 @@ def refit(
         race: whether the starts compete: what is far behind the best is given up.
 
     """
-    lower, upper = bounds_of(bench)
+    lower, upper = bench.bounds
     readings = bench.problem.samples.outputs
     count, width = chosen.shape
     points = starts.copy()

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax import arithmetic, kernels
-from ehsvjax.effects.effect import Candidate, EffectParameter, Scales, constant_of
+from ehsvjax.effects.effect import UNLIMITED, Candidate, EffectParameter, Scales, constant_of
 from ehsvjax.effects.extended import effects_at, switch
 from ehsvjax.effects.internal import Internal
 from ehsvjax.fit import Fit
@@ -87,14 +87,33 @@ class Workbench:
         """The time in s since the start of each record."""
         return np.arange(self.problem.samples.inputs.shape[1]) * self.problem.samples.sample_period[:, None]
 
+    @functools.cached_property
+    def _unknowns(self) -> dict[str, list[tuple[EffectParameter, int]]]:
+        """Every candidate's numbers, each with its column, by the candidate's name."""
+        found: dict[str, list[tuple[EffectParameter, int]]] = {c.name: [] for c in self.candidates}
+        for candidate in self.candidates:
+            for number in candidate.effect.parameters:
+                name = candidate.parameter(number.name)
+                each = [name] if name in self.column else [f"{name}[{k}]" for k in range(len(self.records))]
+                found[candidate.name] += [(number, self.column[one]) for one in each]
+        return found
+
     def unknowns_of(self, candidate: Candidate) -> list[tuple[EffectParameter, int]]:
         """Return an effect's numbers, each with its column; one that is of its run once for every record."""
-        found = []
-        for number in candidate.effect.parameters:
-            name = candidate.parameter(number.name)
-            each = [name] if name in self.column else [f"{name}[{k}]" for k in range(len(self.records))]
-            found += [(number, self.column[one]) for one in each]
-        return found
+        return self._unknowns[candidate.name]
+
+    @functools.cached_property
+    def bounds(self) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " parameter"]]:
+        """The least and the largest coordinate of every unknown."""
+        lower, upper = np.zeros(len(self.nominal)), np.ones(len(self.nominal))
+        for candidate in self.candidates:
+            scales = self.scales[candidate.name]
+            for number, j in self.unknowns_of(candidate):
+                unit = self.problem.coordinates.upper[j]
+                low, high = number.lower(scales), number.upper(scales)
+                lower[j] = -np.inf if low <= -UNLIMITED else low / unit
+                upper[j] = np.inf if high >= UNLIMITED else high / unit
+        return lower, upper
 
     def columns_of(self, candidate: Candidate) -> list[int]:
         """Columns of an effect's numbers."""

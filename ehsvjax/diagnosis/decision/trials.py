@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.progress import Progress
-from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, padded, refit, span
+from ehsvjax.diagnosis.bench.refits import Refits, padded, refit, span
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.diagnosis.hypotheses.curves import Terms, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import parts_of
@@ -127,7 +127,7 @@ def refit_reshaped(trials: Trials, current: Refits, included: Sequence[int], can
     bench = trials.bench
     harmonic = bench.candidates[candidate].effect.harmonic
     shapes = [j for n, j in bench.unknowns_of(bench.candidates[candidate]) if n.absent is None and not harmonic]
-    lower, upper = bounds_of(bench)
+    lower, upper = bench.bounds
     starts = []
     for j, factor in itertools.product(shapes, _SHAPES):
         start = current.points[0].copy()
@@ -181,7 +181,7 @@ def _most_promising(
     best = np.array([a + np.argmin(cost[a:b]) for a, b in itertools.pairwise(edges)])
     as_they_are, refitted = points[1 + best], points[1 + best]
     columns = current.chosen[0][current.chosen[0] >= 0]
-    lower, upper = bounds_of(bench)
+    lower, upper = bench.bounds
     finite = np.where(np.isfinite(r[best]), r[best], 0.0)
     steps = np.linalg.lstsq(jacobian[: len(columns)].T, finite.T, rcond=TOLD_APART)[0].T
     refitted[:, columns] = np.clip(refitted[:, columns] + steps, lower[columns], upper[columns])
@@ -225,7 +225,7 @@ def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " pa
     # Shares of a limit are shares of itself: where it hardly acts yet, no derivative tells how low it is.
     nothing = np.array([0.0 if absent == UNLIMITED else absent for absent in amplitudes.values()])
     absent = nothing / bench.problem.coordinates.upper[columns]
-    lower, upper = bounds_of(bench)
+    lower, upper = bench.bounds
     starts = [screened.start]
     for share in _SHARES if columns else ():
         start = screened.start.copy()

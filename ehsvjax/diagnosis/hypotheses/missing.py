@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, refit, span, unexplained
+from ehsvjax.diagnosis.bench.refits import Refits, refit, span, unexplained
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.hypotheses.curves import (
     TIME,
@@ -254,7 +254,7 @@ def _settled(bench: Workbench, final: Refits, noise: Noise, curve: Curve, point,
     """Estimate a curve together with the refitted unknowns, by Levenberg-Marquardt steps of several dampings each."""
     measured = bench.problem.samples.outputs
     columns = final.chosen[0][final.chosen[0] >= 0]
-    lower, upper = bounds_of(bench)
+    lower, upper = bench.bounds
     r = noise.scaled(measured - outputs_with(bench, point[None], coefficients[None], curve)[0])
     left = float(np.nan_to_num(r @ r, nan=np.inf))
     for _ in range(_STEPS):

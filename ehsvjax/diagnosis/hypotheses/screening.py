@@ -18,7 +18,7 @@ from jaxtyping import Float
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT, corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts
-from ehsvjax.diagnosis.bench.refits import Refits, bounds_of, unexplained
+from ehsvjax.diagnosis.bench.refits import Refits, unexplained
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.hypotheses.harmonics import with_frequencies
 from ehsvjax.effects.effect import UNLIMITED, Candidate
@@ -124,7 +124,7 @@ def responses_at(
 def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> list[Trial]:
     """Return the steps of a candidate: of each amplitude, at each combination of its shapes."""
     scales = bench.scales[candidate.name]
-    lower, _ = bounds_of(bench)
+    lower, _ = bench.bounds
     numbers = bench.unknowns_of(candidate)
     amplitudes = [(number, j) for number, j in numbers if number.absent is not None]
     shapes = [(number, j) for number, j in numbers if number.absent is None]
@@ -243,7 +243,7 @@ def _start(bench: Workbench, trial: Trial, g, r, left):
     steps = np.array([trial.points[row, j] for row, j in enumerate(columns)]) - absent
     if trial.proportional:
         factors = np.linalg.lstsq(g.T, r, rcond=None)[0]
-        lower, upper = bounds_of(bench)
+        lower, upper = bench.bounds
         for j, step, nothing, factor in zip(columns, steps, absent, factors, strict=True):
             start[j] = np.clip(nothing + factor * step, lower[j], upper[j])
     amount = start[columns[0]] * unit[columns[0]]
