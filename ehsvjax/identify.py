@@ -116,7 +116,7 @@ def identify(
     whole("islands", islands, 1)
     devices = None if devices is None else _checked_devices(devices)
     cost = population_cost if devices is None or islands > 1 else shared_cost(devices)
-    model = model.with_bounds(bounds, fixed).with_ties(tied).with_priors(priors)
+    model = model.with_ties(tied).with_bounds(bounds, fixed).with_priors(priors)
     problem = problem_of(model, records, initial=initial, noise_variance=noise_variance, huber=huber)
     check_sizes(population, generations, operators, islands, problem.unknowns)
     whole("starts", starts, 1, population * islands, "at most as many as there are individuals")

@@ -82,6 +82,7 @@ class _Section(NamedTuple):
 _OUTPUT_HEAD = ("output", "rmse", "fit", "noise standard deviation")
 _PARAMETER_HEAD = ("name", "symbol", "value", "standard error", "unit", "bounds")
 # Share of its value from which an error is large.
+_UNKNOWN = "not known"
 _LARGE = 0.1
 # Per cent beyond which a figure says no more than that.
 _ABSURD = 1000.0
@@ -271,7 +272,9 @@ def _prior_row(fit: Fit, precision: Precision | str, parameter: Parameter) -> tu
     assert parameter.prior is not None
     name, (mean, deviation) = parameter.name, parameter.prior
     row = name, f"{mean:.6g} +/- {deviation:.3g}", parameter.unit
-    error = math.inf if isinstance(precision, str) else precision.standard_errors[name]
+    if isinstance(precision, str):
+        return *row, _UNKNOWN, ""
+    error = precision.standard_errors[name]
     information = 1.0 / error**2 - 1.0 / deviation**2 if error > 0.0 else math.inf
     if not _LEAST_TOLD / deviation**2 < information < math.inf:
         return *row, "next to nothing", ""
@@ -294,7 +297,7 @@ def percent_of_fit(percent: float) -> str:
 
 def _error(precision: Precision | str, name: str) -> str:
     if isinstance(precision, str):
-        return "not known"
+        return _UNKNOWN
     error, value = precision.standard_errors[name], precision.values[name]
     if not math.isfinite(error):
         return "not fixed"

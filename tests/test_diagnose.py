@@ -222,6 +222,15 @@ def test_the_gain_is_measured_down_to_the_noise_on_what_was_held_back(diagnosis)
     assert 0.8 < low <= gain.share_removed <= high < 1.2
 
 
+@pytest.mark.parametrize("share", [0.97, 1.053])
+def test_more_than_all_of_an_error_is_said_to_be_chance(diagnosis, share):
+    (before,) = diagnosis.gain.by_record
+    one = before["position"]._replace(share_removed=share)
+    text = str(dataclasses.replace(diagnosis, gain=diagnosis.gain._replace(by_record=({"position": one},))))
+    assert f"{100 * share:.1f}% of the removable error removed" in text
+    assert ("as the noise happens to be less there" in text) == (share > 1.0)
+
+
 def test_the_misfit_is_in_finite_numbers(diagnosis):
     misfit = diagnosis.misfit.outputs["position"]
     assert misfit.noise_floor == pytest.approx(NOISE, rel=0.12)

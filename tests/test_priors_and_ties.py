@@ -209,6 +209,22 @@ def test_ties_may_follow_one_another_and_are_kept_with_the_model(tmp_path):
     assert again.tied == fit.tied and str(again) == str(fit)
 
 
+def test_beside_a_prior_nothing_is_said_of_a_fit_whose_errors_are_not_known(monkeypatch):
+    fit = identified(line_record(), priors={"slope": (MEANS["slope"], 0.01)})
+
+    def refused(fit):
+        raise ValueError("expected a simulation that stays finite")
+
+    monkeypatch.setattr(ehsvjax.Fit, "precision", refused)
+    told, prior = (line for line in str(fit).splitlines() if line.strip().startswith("slope"))
+    assert "not known" in told and "not known" in prior and "next to nothing" not in prior
+
+
+def test_what_follows_a_parameter_follows_it_to_where_it_is_fixed():
+    tied = LINE.with_ties({"offset": lambda p: 2.0 * p["slope"]})
+    assert tied.with_bounds(fixed={"slope": 4.0}).nominal == {"slope": 4.0, "offset": 8.0}
+
+
 def test_a_mass_that_is_given_by_the_stiffness_is_that_of_the_plant():
     tied = carriage().with_ties({"mass": lambda p: MASS / STIFFNESS * p["stiffness"]})
     push = 20.0 * np.sign(np.sin(0.7 * np.arange(0.0, 6.0, 0.02) ** 1.3))
@@ -229,6 +245,11 @@ def test_a_mass_that_is_given_by_the_stiffness_is_that_of_the_plant():
         (lambda: LINE.with_ties({"offset": lambda p: jnp.inf}), "to give a finite number, got inf"),
         (lambda: LINE.with_ties({"offset": twice}).with_ties({"offset": twice}), "expected no value of offset"),
         (lambda: LINE.with_ties({"offset": twice}).with_bounds({"offset": (0.0, 1.0)}), "expected no value of offset"),
+        (
+            lambda: ehsvjax.identify(LINE, line_record(), key=jax.random.key(0), tied={"offset": twice},
+                                     bounds={"offset": (0.0, 1.0)}),
+            "expected no value of offset",
+        ),
         (
             lambda: ehsvjax.simulate(LINE.with_ties({"offset": twice}), line_record(), {"offset": 1.0}),
             "expected no value of offset, which is tied to other parameters of line: give theirs",

@@ -278,9 +278,11 @@ class Model:
                 return p._replace(value=number(p.name, fixed[p.name], remedy="give its value, SI"), fixed=True)
             return p
 
+        parameters = tuple(changed(p) for p in self.parameters)
+        following = tied_values(self.ties, {p.name: p.value for p in parameters})
         return replace(
             self,
-            parameters=tuple(changed(p) for p in self.parameters),
+            parameters=tuple(p._replace(value=following.get(p.name, p.value)) for p in parameters),
             initial=tuple(changed(p) for p in self.initial),
         )
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 # Excluded effects that are printed, and such as come near.
 _NAMED, _NEAREST = 10, 3
+_MORE_THAN_ALL = "; above 100, as the noise happens to be less there than it is estimated"
 
 
 def sentences(diagnosis: "Diagnosis") -> list[str]:
@@ -278,7 +279,7 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
             low, high = g.share_interval
             line += (
                 f"; {100 * g.share_removed:.1f}% of the removable error removed "
-                f"(95%: {100 * low:.1f} to {100 * high:.1f})"
+                f"(95%: {100 * low:.1f} to {100 * high:.1f}{_MORE_THAN_ALL if g.share_removed > 1.0 else ''})"
             )
         lines.append(line)
     return lines
