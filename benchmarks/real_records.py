@@ -26,6 +26,7 @@ from benchmarks import real_models
 from ehsvjax.diagnosis import Diagnosis
 
 DATA = Path(os.environ.get("EHSVJAX_DATA", Path(__file__).parents[2] / "shared" / "data"))
+AT_HAND = (DATA / "silverbox").is_dir()
 
 
 class Rig(NamedTuple):
@@ -228,7 +229,7 @@ def main() -> None:
     chosen = parser.parse_args().rigs or list(RIGS)
     if unknown := set(chosen) - set(RIGS):
         parser.error(f"expected rigs of {', '.join(RIGS)}; got {', '.join(unknown)}")
-    if not DATA.is_dir():
+    if not AT_HAND:
         sys.exit(f"expected the measured records in {DATA}: set EHSVJAX_DATA to where they are")
     rows = []
     for name in chosen:

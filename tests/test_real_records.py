@@ -4,9 +4,9 @@ import jax
 import pytest
 
 import ehsvjax
-from benchmarks.real_records import DATA, RIGS, judged
+from benchmarks.real_records import AT_HAND, RIGS, judged
 
-pytestmark = pytest.mark.skipif(not DATA.exists(), reason="the measured records are not at hand")
+pytestmark = pytest.mark.skipif(not AT_HAND, reason="the measured records are not at hand")
 
 
 def diagnosed(name):
