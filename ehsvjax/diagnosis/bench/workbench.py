@@ -87,20 +87,14 @@ class Workbench:
         """The time in s since the start of each record."""
         return np.arange(self.problem.samples.inputs.shape[1]) * self.problem.samples.sample_period[:, None]
 
-    @functools.cached_property
-    def _unknowns(self) -> dict[str, list[tuple[EffectParameter, int]]]:
-        """Every candidate's numbers, each with its column, by the candidate's name."""
-        found: dict[str, list[tuple[EffectParameter, int]]] = {c.name: [] for c in self.candidates}
-        for candidate in self.candidates:
-            for number in candidate.effect.parameters:
-                name = candidate.parameter(number.name)
-                each = [name] if name in self.column else [f"{name}[{k}]" for k in range(len(self.records))]
-                found[candidate.name] += [(number, self.column[one]) for one in each]
-        return found
-
     def unknowns_of(self, candidate: Candidate) -> list[tuple[EffectParameter, int]]:
         """Return an effect's numbers, each with its column; one that is of its run once for every record."""
-        return self._unknowns[candidate.name]
+        found = []
+        for number in candidate.effect.parameters:
+            name = candidate.parameter(number.name)
+            each = [name] if name in self.column else [f"{name}[{k}]" for k in range(len(self.records))]
+            found += [(number, self.column[one]) for one in each]
+        return found
 
     @functools.cached_property
     def bounds(self) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " parameter"]]:
