@@ -28,8 +28,9 @@ ROUGHLY = 0.3
 """The same where it is still far from the minimum: a step of a quarter would take four times as long."""
 # Of the outputs' own deviation: a noise below this is none that a sensor has, and no arithmetic is asked for it.
 _LEAST_NOISE = 1e-4
-# Integration steps of all records together with which a diagnosis takes minutes: no step that needs more is tried.
-_MOST_STEPS = 2**20
+# Steps a sample that are tried however long a record is; and of all records together, with which a diagnosis takes
+# minutes: more are tried only within that.
+_STEPS_OF_A_SAMPLE, _MOST_STEPS = 64, 2**20
 
 OutputsAt = Callable[[int], Float[np.ndarray, "individual record time signal"]]
 """Outputs of some simulations at so many integration steps per sample."""
@@ -38,7 +39,8 @@ OutputsAt = Callable[[int], Float[np.ndarray, "individual record time signal"]]
 def finest(problem: Problem) -> bool:
     """Whether a problem is stepped as finely as is tried."""
     count, samples = np.shape(problem.samples.inputs)[:2]
-    return 2 * int(problem.substeps) * count * samples > _MOST_STEPS
+    finer = 2 * int(problem.substeps)
+    return finer > _STEPS_OF_A_SAMPLE and finer * count * samples > _MOST_STEPS
 
 
 class Arithmetic(NamedTuple):

@@ -201,6 +201,13 @@ def test_what_is_known_is_off_by_less_than_it_is_said_to_be_worth(errors, order)
     assert left_out.size <= 0.05 * 40 and not (off.size and left_out.size and left_out.min() < off.max() - 1e-12)
 
 
+def test_a_long_record_is_stepped_finer_up_to_a_point_and_a_short_one_beyond():
+    short = alone()
+    long = replace(short, samples=short.samples._replace(inputs=np.zeros((1, 200_000, 1))))
+    tried = {steps: [finest(replace(one, substeps=np.int32(steps))) for one in (short, long)] for steps in (32, 64)}
+    assert tried == {32: [False, False], 64: [False, True]}
+
+
 def test_what_no_step_settles_is_not_stepped_finer_by_the_next_who_tries():
     # A fit hands on the step at which it gave up, and a diagnosis begins there.
     errors = erring(np.full(40, 1e6), 0.25)
