@@ -62,12 +62,10 @@ def trials_of(options) -> list[Trial]:
         for i in range(options.nulls):
             kind = ("white", "AR", "quantised", "outliers")[i % 4]
             found.append(Trial("none", Hidden(model, kind, variances[i % 3], (), seed())))
-        for i in range(options.pairs // 2):
-            pair = tuple(rng.choice(known, 2, replace=False).tolist())
-            found.append(Trial("two", Hidden(model, "white", variances[i % 2], pair, seed())))
-        for i in range(options.triples // 2):
-            three = tuple(rng.choice(known, 3, replace=False).tolist())
-            found.append(Trial("three", Hidden(model, "white", variances[i % 2], three, seed())))
+        for kind, count, together in (("two", options.pairs, 2), ("three", options.triples, 3)):
+            for i in range(count // 2):
+                some = tuple(rng.choice(known, together, replace=False).tolist())
+                found.append(Trial(kind, Hidden(model, "white", variances[i % 2], some, seed())))
         for i in range(options.unknown // 2):
             found.append(Trial("unknown", Hidden(model, "white", variances[0], (unknown[i % len(unknown)],), seed())))
     return [t for t in found if options.kind in ("all", t.kind) and options.model in ("all", t.hidden.model)]
@@ -87,7 +85,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
         if trial.kind != "none" and "process_noise" not in hidden.names:
             known = oracle(hidden, one)
             row |= {"worth": known.worth, "rival_deficit": known.deficit, "rival": known.rival}
-        if trial.kind in ("two", "three"):
+        if len(hidden.names) > 1:
             row["worth_each"] = worth_each(hidden, one)
         key = jax.random.key(hidden.seed)
         began = time.perf_counter()

@@ -155,9 +155,8 @@ def positions(model: str, rig: Rig, effects, finer: int = 1) -> np.ndarray:
         fine = max(min(1e-4, float(0.03 / np.max(rig.parameters["natural_frequency"]))), duration / MOST_STEPS)
         with np.errstate(all="ignore"):
             return servovalve_with(effects, commands, rig.period, fine_step=fine / finer, **rig.parameters)["position"]
-    return van_der_pol_with(effects, commands, rig.period, **rig.parameters, fine_step=VAN_DER_POL_STEP / finer)[
-        "position"
-    ]
+    fine = VAN_DER_POL_STEP / finer
+    return van_der_pol_with(effects, commands, rig.period, fine_step=fine, **rig.parameters)["position"]
 
 
 def sizes_of(trial: Trial, rig: Rig, plain: np.ndarray) -> dict[str, float]:

@@ -8,10 +8,10 @@ package's own loops alone and without a compiler flag:
   itself with loops that touch less than 1 kB (its SmallWhileLoopHoistingPass leaves the same mark).
 - `stored_once` cuts a step at the values that several of its results need, and has each computed and stored once.
 
-- `jit` has XLA compile a program in two thirds of the time.
-
 Measured for 1,024 individuals on one core with AVX2, ns per individual and integration step: servovalve 23 as XLA
 compiles it by default, 11 in one kernel, 3.5 with shared values stored too; Van der Pol 5.8, 1.4 and 0.9.
+
+A long function takes long to compile: `jit` asks XLA, for one program at a time, for the way that is sooner done.
 
 On other platforms, and where a model uses an operation that such a function cannot hold (a sort, a matrix
 decomposition), everything here is the identity.
@@ -67,8 +67,8 @@ def jit(function: Callable | None = None, **static) -> Callable:
     """Return the function as `jax.jit` compiles it, but sooner: XLA's older way to fuse operations makes the same code.
 
     Measured: the search of a servovalve 1.2 s instead of 1.6, its refinement 1.7 instead of 2.6, a bench of all effects
-    4.6 instead of 6.1; they run as fast, and differ in rounding at most. It is an option of a whole program:
-    called within another, the function is compiled as that one is.
+    4.6 instead of 6.1; they run as fast, and differ in rounding at most. It is an option of a whole program: called
+    within another, the function is compiled as that one is.
 
     Args:
         function: to be compiled; none: a decorator is returned.

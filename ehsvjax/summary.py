@@ -81,8 +81,8 @@ class _Section(NamedTuple):
 
 _OUTPUT_HEAD = ("output", "rmse", "fit", "noise standard deviation")
 _PARAMETER_HEAD = ("name", "symbol", "value", "standard error", "unit", "bounds")
-# Share of its value from which an error is large.
 _UNKNOWN = "not known"
+# Share of its value from which an error is large.
 _LARGE = 0.1
 # Per cent beyond which a figure says no more than that.
 _ABSURD = 1000.0
