@@ -45,11 +45,15 @@ class Samples(NamedTuple):
 
 
 class Coordinates(NamedTuple):
-    """How a point of the unit cube becomes values: between bounds, on a straight or on a logarithmic scale."""
+    """How a point of the unit cube becomes values: between bounds, on a straight or on a logarithmic scale.
+
+    The logarithm is that of the value plus an `offset`, between the bounds plus the same.
+    """
 
     lower: Float[Any, " parameter"]
     upper: Float[Any, " parameter"]
     logarithmic: Bool[Any, " parameter"]
+    offset: Float[Any, " parameter"]
 
 
 class Priors(NamedTuple):
@@ -169,25 +173,34 @@ def coordinates_of(parameters: Sequence[Parameter]) -> Coordinates:
         lower=np.array([p.lower for p in parameters], float),
         upper=np.array([p.upper for p in parameters], float),
         logarithmic=np.array([p.scale == "log" for p in parameters], bool),
+        offset=np.zeros(len(parameters)),
     )
+
+
+def in_units(units: Float[np.ndarray, " parameter"]) -> Coordinates:
+    """Return the coordinates that count values in units, from zero."""
+    nothing = np.zeros(len(units))
+    return Coordinates(nothing, units, nothing.astype(bool), nothing)
 
 
 def to_values(coordinates: Coordinates, individuals: Float[Any, "*batch parameter"]):
     """Return the values `[..., parameter]`, SI, of individuals in the unit cube; NumPy for NumPy."""
     xp = np if isinstance(individuals, np.ndarray) else jnp
-    lower, upper, logarithmic = (xp.broadcast_to(c, xp.shape(individuals)) for c in coordinates)
+    lower, upper, logarithmic, offset = (xp.broadcast_to(c, xp.shape(individuals)) for c in coordinates)
     # Both branches stay finite, so that neither spoils the derivative of the other.
-    ratio = xp.where(logarithmic, upper, 1.0) / xp.where(logarithmic, lower, 1.0)
-    logarithmic_values = lower * xp.exp(individuals * xp.log(ratio))
+    least = xp.where(logarithmic, lower + offset, 1.0)
+    ratio = xp.where(logarithmic, upper + offset, 1.0) / least
+    logarithmic_values = least * xp.exp(individuals * xp.log(ratio)) - offset
     return xp.where(logarithmic, logarithmic_values, lower + individuals * (upper - lower))
 
 
 def to_unit(coordinates: Coordinates, values: Float[Any, "*batch parameter"]):
     """Return the individuals `[..., parameter]` in the unit cube that have these values, SI; NumPy for NumPy."""
     xp = np if isinstance(values, np.ndarray) else jnp
-    lower, upper, logarithmic = (xp.broadcast_to(c, xp.shape(values)) for c in coordinates)
-    ratio = xp.where(logarithmic, upper, 2.0) / xp.where(logarithmic, lower, 1.0)
-    relative = xp.where(logarithmic, values / xp.where(logarithmic, lower, 1.0), 1.0)
+    lower, upper, logarithmic, offset = (xp.broadcast_to(c, xp.shape(values)) for c in coordinates)
+    least = xp.where(logarithmic, lower + offset, 1.0)
+    ratio = xp.where(logarithmic, upper + offset, 2.0) / least
+    relative = xp.where(logarithmic, values + offset, 1.0) / least
     return xp.where(logarithmic, xp.log(relative) / xp.log(ratio), (values - lower) / (upper - lower))
 
 

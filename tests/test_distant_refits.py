@@ -12,7 +12,7 @@ from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen
 from ehsvjax.effects import BANK
-from tests.plants import held_levels, servovalve_plant
+from tests.plants import Valve, held_levels, servovalve_plant
 
 # One process compiles.
 pytestmark = pytest.mark.xdist_group("diagnoses of the servovalve")
@@ -29,7 +29,7 @@ def bench_of(model, position, noise, **bounds):
     return workbench(fit, [record], BANK)
 
 
-# --- Supply pressure at half of what was given ---
+# --- A constant that is another than was given: along the flow gain over the constant all but nothing changes ---
 
 SHARES = (0.02, 0.1, 0.2, 0.35, 0.5, 0.7, 1.0)
 
@@ -42,14 +42,18 @@ def starved():
 
 @pytest.fixture(scope="module")
 def led(starved):
-    """Where a wrong supply pressure is led to from shares of its linear estimate."""
-    bench = starved
+    """Where a supply pressure at half of what was given is led to."""
+    return led_to(starved, "supply_pressure")
+
+
+def led_to(bench, constant):
+    """Return the refit without a wrong constant, that from shares of its linear estimate, and its column."""
     noise = plain_noise(np.array([1e-8]), bench.problem.samples.measured)
     trials = trials_of(bench, lambda stage, done: None)
     current = refit_sets(trials, [[bench.nominal]], [()], noise)
     tried = responses_at(bench, current, (), noise, trials.parts)
     names = {bench.candidates[s.candidate].name: s for s in screen(bench, current, tried, noise, 1).ranked}
-    screened = names["supply_pressure"]
+    screened = names[constant]
     (column,) = bench.columns_of(bench.candidates[screened.candidate])
     starts = np.repeat(screened.start[None], len(SHARES), axis=0)
     starts[:, column] = np.clip(np.array(SHARES) * screened.start[column], *(b[column] for b in bench.bounds))
@@ -69,8 +73,18 @@ def test_every_start_leads_to_the_same_minimum(led):
 
 def test_the_supply_pressure_is_that_of_the_plant(led, starved):
     _, found, column = led
-    errors = found.points[:, column] * starved.problem.coordinates.upper[column]
+    errors = [starved.value(point, column) for point in found.points]
     np.testing.assert_allclose(errors, -0.5, atol=0.1)
+
+
+@pytest.mark.parametrize(("constant", "factor"), [("piston_area", 1.94), ("supply_pressure", 1.8)])
+def test_no_start_stops_in_the_valley_of_a_constant_that_is_almost_twice_what_was_given(constant, factor):
+    position = servovalve_plant(COMMAND, 1e-3, **{constant: factor * getattr(Valve(), constant)}).position
+    bench = bench_of(ehsvjax.servovalve(), position, 1e-4, flow_gain=(3e-5, 6e-4))
+    for blamed in ("piston_area", "supply_pressure"):
+        _, found, _ = led_to(bench, blamed)
+        assert found.converged.all()
+        assert np.ptp(found.cost) < 0.5 * INSEPARABLE, (blamed, found.cost)
 
 
 def test_no_unknown_leaves_its_bounds_on_the_way(led, starved):

@@ -127,14 +127,19 @@ def test_missing_samples_and_padding_weigh_nothing():
     st.floats(0, 1),
 )
 def test_unit_cube_and_values_are_inverse(lower, width, positive, ratio, first, second):
+    # The last is a share by which something is off: from 0 to a share, by the logarithm of one and it.
     coordinates = Coordinates(
-        np.array([lower, positive]), np.array([lower + width, positive * ratio]), np.array([False, True])
+        np.array([lower, positive, 0.0]),
+        np.array([lower + width, positive * ratio, ratio - 1.0]),
+        np.array([False, True, True]),
+        np.array([0.0, 0.0, 1.0]),
     )
     with jax.enable_x64(True):
-        values = np.asarray(to_values(coordinates, jnp.array([first, second])))
+        values = np.asarray(to_values(coordinates, jnp.array([first, second, second])))
         assert values[0] == pytest.approx(lower + first * width, rel=1e-9, abs=1e-9)
         assert values[1] == pytest.approx(positive * ratio**second, rel=1e-9)
-        np.testing.assert_allclose(to_unit(coordinates, jnp.asarray(values)), [first, second], atol=1e-6)
+        assert values[2] == pytest.approx(ratio**second - 1.0, rel=1e-9, abs=1e-12)
+        np.testing.assert_allclose(to_unit(coordinates, jnp.asarray(values)), [first, second, second], atol=1e-6)
 
 
 @pytest.mark.parametrize("optimizer", [None, optax.lbfgs(), optax.adam(0.02)], ids=["lm", "lbfgs", "adam"])

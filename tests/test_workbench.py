@@ -80,7 +80,7 @@ def with_each_effect(bench):
     for point, candidate in zip(points, bench.candidates, strict=True):
         for number, j in bench.unknowns_of(candidate):
             tried = number.tries(bench.scales[candidate.name])
-            point[j] = tried[0] / bench.problem.coordinates.upper[j]
+            point[j] = bench.coordinate(tried[0], j)
     return points
 
 
@@ -174,15 +174,14 @@ def test_a_limit_is_found_from_where_it_hardly_acts_yet_beside_a_rival():
     noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
     without = refit_sets(trials, [[bench.nominal]], [()], noise)
     (column,) = bench.columns_of(bench.candidates[limit])
-    unit = bench.problem.coordinates.upper[column]
     start = without.points[0].copy()
-    start[column] = 0.999 * np.max(np.abs(bench.problem.samples.inputs)) / unit
+    start[column] = bench.coordinate(0.999 * np.max(np.abs(bench.problem.samples.inputs)), column)
     some = [
         Screened(i, 5.0, 1e-6, 1e-4, p, np.zeros(SAMPLES), (), False, 0.0)
         for i, p in ((limit, start), (rival, without.points[0]))
     ]
     found = refit_screened(trials, some, (), noise, without)
-    assert found.points[0, column] * unit == pytest.approx(0.7, rel=0.02)
+    assert bench.value(found.points[0], column) == pytest.approx(0.7, rel=0.02)
     assert found.cost[0] < 1.2 * SAMPLES < found.cost[1] < without.cost[0]
 
 

@@ -41,6 +41,8 @@ class EffectParameter(NamedTuple):
             proportional to it, several for one whose effect is not, or for a shape.
         usual: how far from `absent` it usually is at most, beyond which it is rare: `inf` where any value is as usual
             as another; None where nothing is known.
+        relative: whether it is the share by which something is off: what is known is known by its factor, so that it
+            is looked for by the logarithm of that, along which a product of two unknowns is a straight line.
 
     """
 
@@ -51,6 +53,7 @@ class EffectParameter(NamedTuple):
     upper: Callable[[Scales], float]
     tries: Callable[[Scales], Sequence[float]]
     usual: float | None = None
+    relative: bool = False
 
     def rarity(self, value: float) -> float:
         """Return from 0 to 1 how rare a value is: a half where it is as far as usual, or where nothing is known.
@@ -292,6 +295,12 @@ def amplitude(
     """
     function("probe", probe, "of the scales: lambda scales: 1e-3 * scales['value']")
     return EffectParameter(name, unit, 0.0, lower, upper, lambda scales: (probe(scales),), usual)
+
+
+def relative_error(usual: float | None = None) -> EffectParameter:
+    """Return by what share something is more than it is taken for: ten times as much or a tenth at most."""
+    number = amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0), usual)
+    return number._replace(relative=True)
 
 
 def size(

@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Sequence
 
-from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, constant, input_named
+from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, input_named, relative_error
 from ehsvjax.models.model import Model
 
 _FEEDTHROUGH = "feedthrough_of_"
@@ -65,7 +65,7 @@ def _off(name: str) -> Effect:
     return Effect(
         name,
         "constant",
-        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0), usual=math.inf),),
+        (relative_error(usual=math.inf),),
         lambda own, value, context: value * (1.0 + own["error"]),
         says="a constant of the model is another than was given",
         settled_by=_settled_by(name),
@@ -95,7 +95,7 @@ def _changed(name: str) -> Effect:
     return Effect(
         f"{CHANGE}{name}",
         "constant",
-        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
+        (relative_error(),),
         lambda own, value, context: value * (1.0 + own["error"]),
         says="a parameter is another in every record",
         settled_by=f"measure it in every record, and say so: record.at({name}=...)",

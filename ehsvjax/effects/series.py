@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import lax
 
-from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, size, width
+from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, relative_error, size, width
 
 # Share by which what has been calibrated is usually off at most.
 _CALIBRATED = 0.05
@@ -105,7 +105,7 @@ INPUT = (
     Effect(
         "input_gain",
         "input",
-        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0), usual=_CALIBRATED),),
+        (relative_error(usual=_CALIBRATED),),
         lambda own, u, context: u * (1.0 + own["error"]),
         says="the input acts more or less than it says",
         settled_by="measure the input at the plant",
@@ -172,7 +172,7 @@ SENSOR = (
     Effect(
         "sensor_gain",
         "sensor",
-        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0), usual=_CALIBRATED),),
+        (relative_error(usual=_CALIBRATED),),
         lambda own, y, context: y * (1.0 + own["error"]),
         says="the sensor shows more or less than there is",
         settled_by="an external gauge",

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, limit, size, width
+from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, limit, relative_error, size, width
 from ehsvjax.effects.forces import harmonic, harmonic_parameters
 from ehsvjax.effects.series import dead_zone, follow_with_play
 
@@ -203,7 +203,7 @@ DISPLACEMENT = (
     Effect(
         "displacement_gain",
         "displacement",
-        (amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0)),),
+        (relative_error(),),
         lambda own, x, context: x * (1.0 + own["error"]),
         says="it acts more or less than it is",
         settled_by="measure there",

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ehsvjax.fit import Fit
-from ehsvjax.population import Coordinates, Problem, cast, simulated, to_unit
+from ehsvjax.population import Problem, cast, in_units, simulated, to_unit
 from ehsvjax.precision.of_fit import prepared
 from ehsvjax.record import Record
 from ehsvjax.refine import refine
@@ -73,7 +73,7 @@ def explained(fit: Fit, records: Sequence[Record], experiments: int, noise_varia
     unknown = np.arange(count + starts)[:, None] == each
     problem = replace(
         problem,
-        coordinates=Coordinates(np.zeros(len(each)), scale[each], np.zeros(len(each), bool)),
+        coordinates=in_units(scale[each]),
         noise_variance=np.array([noise_variance[name] for name in problem.observed]),
         substeps=_finer(problem, fit),
     )

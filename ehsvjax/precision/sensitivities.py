@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ehsvjax import kernels
-from ehsvjax.population import Coordinates, Problem, cast, simulated
+from ehsvjax.population import Problem, cast, in_units, simulated
 
 ROUNDING = 1e-8
 """Singular values of sensitivities below this share of the largest are rounding in float64."""
@@ -62,10 +62,9 @@ def sensitivities(problem: Problem, values: Float[np.ndarray, " parameter"]) -> 
     """Return the sensitivities at values of the unknowns, SI; the problem's arrays are NumPy's."""
     lower, upper = problem.coordinates.lower, problem.coordinates.upper
     width = upper - lower
-    in_widths = Coordinates(np.zeros_like(width), width, np.zeros(len(width), bool))
     with jax.enable_x64(True):
         y, jacobian = _simulated_and_jacobian(
-            cast(replace(problem, coordinates=in_widths), jnp.float64), jnp.asarray(values / width)
+            cast(replace(problem, coordinates=in_units(width)), jnp.float64), jnp.asarray(values / width)
         )
     is_parameter = np.arange(len(width)) < len(problem.free)
     relative = is_parameter & ((lower > 0) | (upper < 0)) & (values != 0)

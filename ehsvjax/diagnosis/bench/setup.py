@@ -13,7 +13,7 @@ from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
 from ehsvjax.effects.of_model import differences_for, effects_for
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model, Parameter
-from ehsvjax.population import observed_outputs, to_unit
+from ehsvjax.population import observed_outputs
 from ehsvjax.record import Record
 from ehsvjax.unknowns import problem_of
 
@@ -102,14 +102,15 @@ def _bench(
             tried = p.tries(scales[c.name])
             unit = max((abs(t) for t in tried), default=1.0) or 1.0
             coordinates.lower[j], coordinates.upper[j] = 0.0, unit
-            nominal[j] = (p.absent if p.absent is not None else (tried[0] if len(tried) else unit)) / unit
+            coordinates.logarithmic[j], coordinates.offset[j] = p.relative, float(p.relative)
+            first = tried[0] if len(tried) else unit
+            nominal[j] = bench.coordinate(first if p.absent is None else p.absent, j)
             if p.absent is not None:
                 differences[j] = _DIFFERENCE_OF_SIZE
     values = fit.parameters | {f"{n}[{k}]": value for k, start in enumerate(initial) for n, value in start.items()}
     names = problem.names
     for j in bench.base_columns:
-        one = [np.array([v]) for v in (coordinates.lower[j], coordinates.upper[j], coordinates.logarithmic[j])]
-        nominal[j] = np.clip(to_unit(type(coordinates)(*one), np.array([values[names[j]]]))[0], 0.0, 1.0)
+        nominal[j] = np.clip(bench.coordinate(values[names[j]], j), 0.0, 1.0)
     return bench
 
 

@@ -5,6 +5,7 @@ of the initial conditions. What is tried differs in its data only, so that nothi
 """
 
 import functools
+import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +23,7 @@ from ehsvjax.effects.extended import effects_at, switch
 from ehsvjax.effects.internal import Internal
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
-from ehsvjax.population import Problem, cast, simulated, to_values
+from ehsvjax.population import Coordinates, Problem, cast, simulated, to_unit, to_values
 from ehsvjax.record import Record
 
 # Simulated side by side: so few that a handful of points keeps all cores busy.
@@ -103,10 +104,9 @@ class Workbench:
         for candidate in self.candidates:
             scales = self.scales[candidate.name]
             for number, j in self.unknowns_of(candidate):
-                unit = self.problem.coordinates.upper[j]
                 low, high = number.lower(scales), number.upper(scales)
-                lower[j] = -np.inf if low <= -UNLIMITED else low / unit
-                upper[j] = np.inf if high >= UNLIMITED else high / unit
+                lower[j] = -np.inf if low <= -UNLIMITED else self.coordinate(low, j)
+                upper[j] = np.inf if high >= UNLIMITED else self.coordinate(high, j)
         return lower, upper
 
     def columns_of(self, candidate: Candidate) -> list[int]:
@@ -142,7 +142,21 @@ class Workbench:
 
     def value(self, point: Float[np.ndarray, " parameter"], column: int) -> float:
         """Value of one unknown at a point, SI."""
-        return float(to_values(self.problem.coordinates, point)[column])
+        return to_values(self._coordinates_of(column), point[[column]]).item()
+
+    def coordinate(self, value: float, column: int) -> float:
+        """Coordinate of one unknown that has this value, SI."""
+        return to_unit(self._coordinates_of(column), np.array([value], float)).item()
+
+    def value_by_coordinate(self, point: Float[np.ndarray, " parameter"], column: int) -> float:
+        """Derivative of the value of one unknown by its coordinate at a point, SI."""
+        lower, upper, logarithmic, offset = (each.item() for each in self._coordinates_of(column))
+        if not logarithmic:
+            return upper - lower
+        return (self.value(point, column) + offset) * math.log((upper + offset) / (lower + offset))
+
+    def _coordinates_of(self, column: int) -> Coordinates:
+        return Coordinates(*(each[[column]] for each in self.problem.coordinates))
 
     def simulated(
         self,

@@ -223,8 +223,7 @@ def _starts(bench: Workbench, screened: Screened) -> list[Float[np.ndarray, " pa
     amplitudes = {j: number.absent for number, j in bench.unknowns_of(candidate) if number.absent is not None}
     columns = list(amplitudes)
     # Shares of a limit are shares of itself: where it hardly acts yet, no derivative tells how low it is.
-    nothing = np.array([0.0 if absent == UNLIMITED else absent for absent in amplitudes.values()])
-    absent = nothing / bench.problem.coordinates.upper[columns]
+    absent = np.array([0.0 if absent == UNLIMITED else bench.nominal[j] for j, absent in amplitudes.items()])
     lower, upper = bench.bounds
     starts = [screened.start]
     for share in _SHARES if columns else ():

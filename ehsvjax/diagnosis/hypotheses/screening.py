@@ -128,16 +128,15 @@ def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> lis
     numbers = bench.unknowns_of(candidate)
     amplitudes = [(number, j) for number, j in numbers if number.absent is not None]
     shapes = [(number, j) for number, j in numbers if number.absent is None]
-    upper = bench.problem.coordinates.upper
     found = []
     for values in itertools.product(*(number.tries(scales) for number, _ in shapes)):
         at = point.copy()
         for (_, j), value in zip(shapes, values, strict=True):
-            at[j] = value / upper[j]
+            at[j] = bench.coordinate(value, j)
         for steps in itertools.zip_longest(*(number.tries(scales) for number, _ in amplitudes)):
             moved = np.repeat(at[None], len(amplitudes), axis=0)
             for row, ((_, j), value) in enumerate(zip(amplitudes, steps, strict=True)):
-                moved[row, j] = value / upper[j]
+                moved[row, j] = bench.coordinate(value, j)
             number, first = amplitudes[0]
             tried = number.tries(scales)
             limited = number.absent == UNLIMITED or (number.absent == 0.0 and lower[first] >= 0.0)
@@ -238,15 +237,15 @@ def _start(bench: Workbench, trial: Trial, g, r, left):
     amplitudes = {j: number.absent for number, j in bench.unknowns_of(candidate) if number.absent is not None}
     columns = list(amplitudes)
     start = trial.points[0].copy()
-    unit = bench.problem.coordinates.upper
-    absent = np.array(list(amplitudes.values())) / unit[columns]
+    absent = bench.nominal[columns]
     steps = np.array([trial.points[row, j] for row, j in enumerate(columns)]) - absent
     if trial.proportional:
         factors = np.linalg.lstsq(g.T, r, rcond=None)[0]
         lower, upper = bench.bounds
         for j, step, nothing, factor in zip(columns, steps, absent, factors, strict=True):
             start[j] = np.clip(nothing + factor * step, lower[j], upper[j])
-    amount = start[columns[0]] * unit[columns[0]]
-    if amplitudes[columns[0]] == UNLIMITED or not steps[0]:
-        return start, float(amount), ()
-    return start, float(amount), ((float(abs(steps[0] * unit[columns[0]])), float(left[0])),)
+    first, nothing = columns[0], amplitudes[columns[0]]
+    amount = bench.value(start, first)
+    if nothing == UNLIMITED or not steps[0]:
+        return start, amount, ()
+    return start, amount, ((abs(bench.value(trial.points[0], first) - nothing), float(left[0])),)

@@ -145,7 +145,7 @@ def _standard_errors(selection: Selection) -> dict[int, float]:
     for column, influence in zip(columns.tolist(), _influences(jacobian), strict=True):
         if influence.any():
             variance = float(influence @ influence) * noise.left_along(influence, left)[0]
-            found[column] = float(np.sqrt(variance)) * float(selection.bench.problem.coordinates.upper[column])
+            found[column] = float(np.sqrt(variance)) * selection.bench.value_by_coordinate(final.points[0], column)
     return found
 
 
