@@ -20,6 +20,8 @@ from ehsvjax.refine import Refined, refine
 
 # Of refinement, at most, until the weights of the outputs, the step and the readings that are known no longer change.
 _ROUNDS = 10
+# Where an unknown that changes nothing at a minimum may act, over its bounds.
+_PLACES = np.linspace(0.0, 1.0, 33)
 
 
 class Best(NamedTuple):
@@ -124,6 +126,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
         # Nothing is held, but a profile, which does hold something, then finds this program compiled.
         nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
         refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
+        refined = _off_plateaus(problem, refined)
         agreeing = _agreeing(problem, refined)
         weighed = len(problem.observed) > 1 or problem.huber is not None or problem.priors is not None
         for _ in range(_ROUNDS):
@@ -150,6 +153,31 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
             if known.substeps != before.substeps:
                 agreeing = _agreeing(problem, refined)
         return refined, agreeing, problem
+
+
+def _off_plateaus(problem: Problem, refined: Refined) -> Refined:
+    """Return where refinement leads from where idle unknowns act, if that is lower; else what it gave.
+
+    A saturation beyond all that a valve moves changes nothing: no derivative leads away from there, however many starts
+    agree, and what a lower one would do passes for something that the model lacks.
+    """
+    best = int(np.argmin(refined.cost))
+    here = refined.individual[best]
+    idle = np.flatnonzero(np.diagonal(refined.information[best])[: len(problem.free)] < NO_CHANGE)
+    if not len(idle):
+        return refined
+    rows = np.repeat(here[None], len(idle) * len(_PLACES), axis=0)
+    rows[np.arange(len(rows)), np.repeat(idle, len(_PLACES))] = np.tile(_PLACES, len(idle))
+    off = np.stack([residuals_at(problem, row) for row in rows])
+    acts = np.sum((off - residuals_at(problem, here)) ** 2, axis=(1, 2, 3)) > NO_CHANGE
+    cost = np.where(acts, np.sum(off**2, axis=(1, 2, 3)), np.inf)
+    cost = np.where(np.isnan(cost), np.inf, cost)
+    if not np.isfinite(cost).any():
+        return refined
+    starts = rows[np.argsort(cost)[: np.isfinite(cost).sum()]]
+    starts = starts[np.arange(len(refined.cost)) % len(starts)]
+    elsewhere = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts), held=jnp.zeros(starts.shape, bool)))
+    return elsewhere if np.min(elsewhere.cost) < refined.cost[best] else refined
 
 
 def _agreeing(problem: Problem, refined: Refined) -> int:
