@@ -13,7 +13,9 @@ Scales = Mapping[str, Any]
 """How large things are in a record: `value`, the largest size of the signal itself (of a constant how large it can be,
 and the `least` that it can), and of each quantity of its context by name (0 where nothing is known), with `+` or `-`
 behind the name how far it goes on that side; `duration` and `sample_period` in s, `frequencies` in rad/s at which a
-harmonic effect would explain most, and `probe`, a disturbance of a force that moves the machine a little."""
+harmonic effect would explain most, and `probe`, a disturbance of a force that moves the machine by `PROBED`."""
+PROBED = 1e-4
+"""Share of an output's size by which a probe moves it."""
 
 
 def input_named(name: str) -> str:

@@ -5,15 +5,20 @@ import math
 
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import UNLIMITED, Effect, EffectParameter, Scales, amplitude, shape, size
+from ehsvjax.effects.effect import PROBED, UNLIMITED, Effect, EffectParameter, Scales, amplitude, shape, size
 
-# Of an end stop, N/m: at most what an explicit force bears at a quarter of a millisecond.
-_STOP_STIFFNESS, _SOFTEST, _STIFFEST = (1e7, 3e7, 1e8), 1e6, 3e8
+# Stiffness of an end stop over that of the machine: a softer one is a spring, a stiffer one a wall.
+_STOP_STIFFNESS, _SOFTEST, _STIFFEST = (6.0, 18.0, 60.0), 0.1, 200.0
 
 
 def _probe(scales: Scales) -> float:
     """Return a force that moves the machine a little, which is known only once one was tried."""
     return scales["probe"]
+
+
+def _stiffness(scales: Scales) -> float:
+    """Return how stiff a machine is: the force that moves it as far as it goes, over that way."""
+    return _probe(scales) / (PROBED * (scales["position"] or 1.0))
 
 
 def _per(quantity: str, power: int):
@@ -99,8 +104,12 @@ def _stop(side):
         lambda s: [t * s[reach] for t in (0.98, 0.9, 0.75)],
     )  # fmt: skip
     hardness = shape(
-        stiffness, "{value}/{length}", lambda s: _STOP_STIFFNESS, lambda s: _SOFTEST, lambda s: _STIFFEST
-    )  # fmt: skip
+        stiffness,
+        "{value}/{length}",
+        lambda s: [times * _stiffness(s) for times in _STOP_STIFFNESS],
+        lambda s: _SOFTEST * _stiffness(s),
+        lambda s: _STIFFEST * _stiffness(s),
+    )
     return _load(
         "end_stop",
         (position, hardness),

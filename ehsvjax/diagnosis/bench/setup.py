@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.workbench import ROUNDING, Workbench, duration_of
-from ehsvjax.effects.effect import Candidate, Effect, EffectParameter, Scales, candidates, input_named
+from ehsvjax.effects.effect import PROBED, Candidate, Effect, EffectParameter, Scales, candidates, input_named
 from ehsvjax.effects.extended import disturbance, extended
 from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
 from ehsvjax.effects.of_model import differences_for, effects_for
@@ -21,8 +21,8 @@ from ehsvjax.unknowns import problem_of
 _PLACES = ("force", "load", "opening", "supply", "damping", "displacement")
 # Of coordinates, for derivatives. An effect's size may count so little in its own that rounding would drown it.
 _DIFFERENCE, _DIFFERENCE_OF_SIZE = 1e-6, 1e-3
-# Share of what runs along a signal that is tried first, and by which a probe then moves the outputs.
-_PROBE, _MOVED = 1e-3, 1e-4
+# Share of what runs along a signal that is tried first.
+_PROBE = 1e-3
 
 
 def workbench(fit: Fit, records: Sequence[Record], bank: Sequence[Effect]) -> Workbench:
@@ -44,7 +44,7 @@ def workbench(fit: Fit, records: Sequence[Record], bank: Sequence[Effect]) -> Wo
 
 
 def _calibrated(bench: Workbench) -> dict[str, float]:
-    """Return for each place the disturbance that, held, moves some output by `_MOVED` of its size."""
+    """Return for each place the disturbance that, held, moves some output by `PROBED` of its size."""
     points = np.repeat(bench.nominal[None], 1 + len(bench.places), axis=0)
     added = np.zeros((len(points), *bench.disturbances.shape))
     for k, place in enumerate(bench.places):
@@ -53,7 +53,7 @@ def _calibrated(bench: Workbench) -> dict[str, float]:
     size = np.maximum(np.std(outputs[0], axis=(0, 1)), 1e-300)
     moved = np.max(np.std(outputs[1:] - outputs[0], axis=(1, 2)) / size, axis=1)
     return {
-        place: bench.probes[place] * (_MOVED / by if np.isfinite(by) and by > ROUNDING else 1.0)
+        place: bench.probes[place] * (PROBED / by if np.isfinite(by) and by > ROUNDING else 1.0)
         for place, by in zip(bench.places, moved, strict=True)
     }
 
