@@ -198,7 +198,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
 
 def outcome(row) -> str:
     """Judge one trial."""
-    if row["verdict"] in ("failed", "unexplained"):
+    if row["verdict"] in ("failed", "unexplained", "no oracle"):
         return row["verdict"]
     if row["kind"] == "none":
         return "right" if row["verdict"] == "adequate" else "false alarm"

@@ -1,5 +1,8 @@
 """Refits of a servovalve from far off and on machines of any size: one valley, and derivatives that are right."""
 
+from collections import Counter
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
+from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen
 from ehsvjax.effects import BANK
@@ -85,6 +89,27 @@ def test_no_start_stops_in_the_valley_of_a_constant_that_is_almost_twice_what_wa
         _, found, _ = led_to(bench, blamed)
         assert found.converged.all()
         assert np.ptp(found.cost) < 0.5 * INSEPARABLE, (blamed, found.cost)
+
+
+def test_most_of_the_way_to_a_minimum_is_gone_at_the_step_of_sketches(starved, monkeypatch):
+    noise = plain_noise(np.array([1e-8]), starved.problem.samples.measured)
+    start = starved.nominal[None].copy()
+    start[0, starved.base_columns] += 0.02
+    columns = padded([starved.base_columns], most_unknowns(starved))
+    simulated, found, spent = Workbench.simulated, {}, Counter()
+
+    def counted(bench, points, *others):
+        spent[int(bench.problem.substeps)] += len(points)
+        return simulated(bench, points, *others)
+
+    monkeypatch.setattr(Workbench, "simulated", counted)
+    for sketched_at in (32, 4):
+        spent.clear()
+        fine = replace(starved, problem=replace(starved.problem, substeps=np.int32(32)), sketched_at=sketched_at)
+        found[sketched_at] = refit(fine, start, columns, noise).cost[0], spent[32]
+    (cost, simulations), (sketched_cost, fewer) = found[32], found[4]
+    assert sketched_cost == pytest.approx(cost, abs=1.0)
+    assert fewer < 0.5 * simulations, found
 
 
 def test_no_unknown_leaves_its_bounds_on_the_way(led, starved):

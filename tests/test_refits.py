@@ -24,7 +24,8 @@ class Bent(Workbench):
         for name, value in {
             "candidates": (),
             "nominal": np.zeros(1),
-            "problem": SimpleNamespace(samples=readings),
+            "problem": SimpleNamespace(samples=readings, substeps=1),
+            "sketched_at": 1,
         }.items():
             object.__setattr__(self, name, value)
 
