@@ -25,7 +25,6 @@ class Bent(Workbench):
             "candidates": (),
             "nominal": np.zeros(1),
             "problem": SimpleNamespace(samples=readings, substeps=1),
-            "sketched_at": 1,
         }.items():
             object.__setattr__(self, name, value)
 

@@ -16,8 +16,8 @@ _ITERATIONS = 60
 _HOPELESS = 5.0
 _PATIENCE = 4
 _STEEPEST = 1e100
-# How many times finer a step is before a refit begins with the one at which trials are sketched.
-_FINE = 4
+# How many times as long the steps are at which a refit begins where that many times as many are not few.
+_COARSER = 8
 # Share of a step at which its curvature is taken, and of the step that its acceleration may be.
 _AHEAD, _MOST_BENT = 0.1, 0.75
 
@@ -105,8 +105,8 @@ def refit(
         race: whether the starts compete: what is far behind the best is given up.
 
     """
-    if iterations > 1 and _FINE * bench.sketched_at <= int(bench.problem.substeps):
-        starts = _sketched(bench, starts, chosen, noise, race)
+    if iterations > 1 and int(bench.problem.substeps) >= _COARSER**2:
+        starts = _led_roughly(bench, starts, chosen, noise, race)
     lower, upper = bench.bounds
     readings = bench.problem.samples.outputs
     count, width = chosen.shape
@@ -166,12 +166,12 @@ def refit(
     )
 
 
-def _sketched(bench: Workbench, starts, chosen, noise: Noise, race: bool) -> Float[np.ndarray, "individual parameter"]:
-    """Return where each start leads at the step at which trials are sketched, or itself where that is better.
+def _led_roughly(bench: Workbench, starts, chosen, noise: Noise, race) -> Float[np.ndarray, "individual parameter"]:
+    """Return where each start leads at a step that is many times longer, or itself where that is better.
 
-    Most of the way is gone at a step that is many times longer; what is compared in the end is exact.
+    Most of the way to a minimum needs no exact arithmetic; what is compared in the end has it.
     """
-    rough = replace(bench, problem=replace(bench.problem, substeps=np.int32(bench.sketched_at)))
+    rough = replace(bench, problem=replace(bench.problem, substeps=bench.problem.substeps // _COARSER))
     led = refit(rough, starts, chosen, noise, race=race).points
     off = noise.scaled(bench.problem.samples.outputs - bench.simulated(np.concatenate([starts, led])))
     as_it_was, after = np.sum(off**2, axis=1).reshape(2, -1)
