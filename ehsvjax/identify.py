@@ -71,9 +71,9 @@ def identify(
 
     A genetic algorithm in float32 searches within the bounds; then the best few individuals are refined in float64
     until the residual sum of squares is as good as at its minimum; from where a parameter changes nothing, as a
-    saturation that is never reached, it is looked for where it does. Records of different length share the parameters and
-    keep their own initial conditions. Several outputs are weighted by their noise: first as guessed from the records'
-    third differences, in the refinement by the variance of their own residuals (maximum likelihood).
+    saturation that is never reached, it is looked for where it does. Records of different length share the parameters
+    and keep their own initial conditions. Several outputs are weighted by their noise: first as guessed from the
+    records' third differences, in the refinement by the variance of their own residuals (maximum likelihood).
 
     Args:
         model: what to identify; its free parameters are the unknowns.
