@@ -162,7 +162,7 @@ def _off_plateaus(problem: Problem, refined: Refined) -> Refined:
     agree, and what a lower one would do passes for something that the model lacks.
     """
     best = int(np.argmin(refined.cost))
-    here = refined.individual[best]
+    here = np.asarray(refined.individual[best])
     idle = np.flatnonzero(np.diagonal(refined.information[best])[: len(problem.free)] < NO_CHANGE)
     if not len(idle):
         return refined
@@ -171,11 +171,11 @@ def _off_plateaus(problem: Problem, refined: Refined) -> Refined:
     off = np.stack([residuals_at(problem, row) for row in rows])
     acts = np.sum((off - residuals_at(problem, here)) ** 2, axis=(1, 2, 3)) > NO_CHANGE
     cost = np.where(acts, np.sum(off**2, axis=(1, 2, 3)), np.inf)
-    cost = np.where(np.isnan(cost), np.inf, cost)
-    if not np.isfinite(cost).any():
+    acting = rows[np.argsort(cost)[: np.isfinite(cost).sum()]]
+    if not len(acting):
         return refined
-    starts = rows[np.argsort(cost)[: np.isfinite(cost).sum()]]
-    starts = starts[np.arange(len(refined.cost)) % len(starts)]
+    # As many as there were: nothing is compiled anew.
+    starts = acting[np.arange(len(refined.cost)) % len(acting)]
     elsewhere = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts), held=jnp.zeros(starts.shape, bool)))
     return elsewhere if np.min(elsewhere.cost) < refined.cost[best] else refined
 
