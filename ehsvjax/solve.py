@@ -123,10 +123,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     own, nominal_initial = len(problem.free), np.asarray(starts)[-1, len(problem.free) :]
     problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
     with jax.enable_x64(True):
-        # Nothing is held, but a profile, which does hold something, then finds this program compiled.
-        nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
-        refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing))
-        refined = _off_plateaus(problem, refined)
+        refined = _off_plateaus(problem, _refined(problem, starts))
         agreeing = _agreeing(problem, refined)
         weighed = len(problem.observed) > 1 or problem.huber is not None or problem.priors is not None
         for _ in range(_ROUNDS):
@@ -149,7 +146,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
                 break
             problem = known
             # From where each start has led: what kept them apart may have been the arithmetic.
-            refined = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts), held=nothing))
+            refined = _refined(problem, starts)
             if known.substeps != before.substeps:
                 agreeing = _agreeing(problem, refined)
         return refined, agreeing, problem
@@ -176,7 +173,7 @@ def _off_plateaus(problem: Problem, refined: Refined) -> Refined:
         return refined
     # As many as there were: nothing is compiled anew.
     starts = acting[np.arange(len(refined.cost)) % len(acting)]
-    elsewhere = _in_numpy(refine(cast(problem, jnp.float64), jnp.asarray(starts), held=jnp.zeros(starts.shape, bool)))
+    elsewhere = _refined(problem, starts)
     return elsewhere if np.min(elsewhere.cost) < refined.cost[best] else refined
 
 
@@ -186,8 +183,12 @@ def _agreeing(problem: Problem, refined: Refined) -> int:
     return int(np.sum(refined.cost <= least * (1.0 + 0.1 / np.sum(problem.samples.measured))))
 
 
-def _in_numpy(refined: Refined) -> Refined:
-    return jax.tree.map(np.array, refined)
+def _refined(problem: Problem, starts) -> Refined:
+    """Return where refinement leads from each start, in NumPy; where double precision is enabled."""
+    # Nothing is held, but a profile, which does hold something, then finds this program compiled.
+    nothing = jnp.asarray(np.zeros(np.shape(starts), bool))
+    found = refine(cast(problem, jnp.float64), jnp.asarray(starts, jnp.float64), held=nothing)
+    return jax.tree.map(np.array, found)
 
 
 def _residual_variance(

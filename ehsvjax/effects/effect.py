@@ -305,6 +305,12 @@ def relative_error(usual: float | None = None) -> EffectParameter:
     return number._replace(relative=True)
 
 
+def off_by_error(own: Mapping[str, Any], value: Any, context: Mapping[str, Any]) -> Any:
+    """Return a value that is more by its `relative_error`."""
+    del context
+    return value * (1.0 + own["error"])
+
+
 def size(
     name: str,
     unit: str,

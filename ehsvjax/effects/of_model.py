@@ -4,7 +4,7 @@ import functools
 import math
 from collections.abc import Sequence
 
-from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, input_named, relative_error
+from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, input_named, off_by_error, relative_error
 from ehsvjax.models.model import Model
 
 _FEEDTHROUGH = "feedthrough_of_"
@@ -66,7 +66,7 @@ def _off(name: str) -> Effect:
         name,
         "constant",
         (relative_error(usual=math.inf),),
-        lambda own, value, context: value * (1.0 + own["error"]),
+        off_by_error,
         says="a constant of the model is another than was given",
         settled_by=_settled_by(name),
     )
@@ -96,7 +96,7 @@ def _changed(name: str) -> Effect:
         f"{CHANGE}{name}",
         "constant",
         (relative_error(),),
-        lambda own, value, context: value * (1.0 + own["error"]),
+        off_by_error,
         says="a parameter is another in every record",
         settled_by=f"measure it in every record, and say so: record.at({name}=...)",
         by_record=True,

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jax import lax
 
-from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, relative_error, size, width
+from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, off_by_error, relative_error, size, width
 
 # Share by which what has been calibrated is usually off at most.
 _CALIBRATED = 0.05
@@ -106,7 +106,7 @@ INPUT = (
         "input_gain",
         "input",
         (relative_error(usual=_CALIBRATED),),
-        lambda own, u, context: u * (1.0 + own["error"]),
+        off_by_error,
         says="the input acts more or less than it says",
         settled_by="measure the input at the plant",
     ),
@@ -173,7 +173,7 @@ SENSOR = (
         "sensor_gain",
         "sensor",
         (relative_error(usual=_CALIBRATED),),
-        lambda own, y, context: y * (1.0 + own["error"]),
+        off_by_error,
         says="the sensor shows more or less than there is",
         settled_by="an external gauge",
     ),

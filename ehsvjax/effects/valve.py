@@ -2,7 +2,17 @@
 
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import Effect, EffectParameter, amplitude, constant, limit, relative_error, size, width
+from ehsvjax.effects.effect import (
+    Effect,
+    EffectParameter,
+    amplitude,
+    constant,
+    limit,
+    off_by_error,
+    relative_error,
+    size,
+    width,
+)
 from ehsvjax.effects.forces import harmonic, harmonic_parameters
 from ehsvjax.effects.series import dead_zone, follow_with_play
 
@@ -204,7 +214,7 @@ DISPLACEMENT = (
         "displacement_gain",
         "displacement",
         (relative_error(),),
-        lambda own, x, context: x * (1.0 + own["error"]),
+        off_by_error,
         says="it acts more or less than it is",
         settled_by="measure there",
     ),
