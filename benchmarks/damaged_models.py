@@ -200,8 +200,12 @@ FAULTS = {
     "NaN in the rate": lambda: with_derivative(lambda p, level, u: jnp.log(-p["gain"]) * u),
     "division by zero": lambda: with_derivative(lambda p, level, u: u / (p["gain"] - p["gain"])),
     "NaN in an output": lambda: with_outputs(lambda state: {"level": jnp.sqrt(-1.0 - state["level"] ** 2)}),
-    "prepare of another shape": lambda: tank(prepare=lambda parameters, inputs, period: inputs[1:]),
-    "prepare by NumPy": lambda: tank(prepare=lambda parameters, inputs, period: np.cumsum(inputs)),
+    "prepare of another shape": lambda: tank(
+        prepare=lambda parameters, inputs, period: {"command": inputs["command"][1:]}
+    ),
+    "prepare by NumPy": lambda: tank(
+        prepare=lambda parameters, inputs, period: {"command": np.cumsum(inputs["command"])}
+    ),
     "prepare to None": lambda: tank(prepare=lambda parameters, inputs, period: None),
     "the longest step is tiny": lambda: tank(max_step=1e-300),
     "equations that cannot be hashed": lambda: tank(start=_Unhashable()),

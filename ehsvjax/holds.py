@@ -23,7 +23,7 @@ _NEIGHBOURS, _BAND = 16, 0.8
 
 
 def course(inputs: Float[Array, "time input"], holds: Float[Array, " input"] | None, most: str) -> tuple[Array, ...]:
-    """Return what `between` needs of each period: coefficients `[time, input]` of a polynomial.
+    """Return what `between` needs of each period: coefficients `[time, input]` of a polynomial, the constant first.
 
     Args:
         inputs: their values at the samples.
@@ -33,26 +33,55 @@ def course(inputs: Float[Array, "time input"], holds: Float[Array, " input"] | N
     """
     if most == "zero":
         return (inputs,)
-    following = jnp.concatenate([inputs[1:], inputs[-1:]])
-    following = following if holds is None else jnp.where(holds > 0.0, following, inputs)
+    step = following(inputs) - inputs
     if most == "linear":
-        return inputs, following
-    step = following - inputs
-    smooth = jnp.ones(inputs.shape[1], bool) if holds is None else holds > 1.0
+        return inputs, step if holds is None else jnp.where(holds > 0.0, step, 0.0)
+    if holds is None:
+        return inputs, *_quintic(inputs)
     # Straight lines and constants are such polynomials too.
     first, *higher = _quintic(inputs)
-    return inputs, jnp.where(smooth, first, step), *(jnp.where(smooth, c, 0.0) for c in higher)
+    first = jnp.where(holds > 1.0, first, jnp.where(holds > 0.0, step, 0.0))
+    return inputs, first, *(jnp.where(holds > 1.0, c, 0.0) for c in higher)
 
 
 def between(course: tuple[Any, ...], fraction: Any) -> Any:
     """Return the inputs at a fraction of a period, from what `course` says of it."""
-    if len(course) == 2:
-        now, then = course
-        return now + fraction * (then - now)
     value = course[-1]
     for coefficient in course[-2::-1]:
         value = coefficient + fraction * value
     return value
+
+
+def at_nodes(course: tuple[Array, ...]) -> Float[Array, "time node input"]:
+    """Return the inputs at the start, in the middle and at the end of every period."""
+    return jnp.stack([between(course, fraction) for fraction in (0.0, 0.5, 1.0)], axis=1)
+
+
+def through_nodes(nodes: Float[Array, "time node"], hold: Float[Array, ""] | None, most: str) -> tuple[Array, ...]:
+    """Return the course `[time]` of one input that was changed at the nodes: parabolas, unless it keeps to a band.
+
+    Args:
+        nodes: as of `at_nodes`; the end of a period may be another value than the start of the next.
+        hold: its place in HOLDS; None: as `most` says.
+        most: the last of HOLDS that any input has; static.
+
+    """
+    start, middle, end = nodes.T
+    parabola = start, 4.0 * middle - 3.0 * start - end, 2.0 * (start + end) - 4.0 * middle
+    if most != "band-limited":
+        return parabola
+    # Where one period ends and the next begins is a sample of the smooth curve.
+    samples = jnp.concatenate([start[:1], 0.5 * (end[:-1] + start[1:])])
+    smooth = tuple(c[:, 0] for c in course(samples[:, None], None, most))
+    if hold is None:
+        return smooth
+    bent = (*parabola, *[jnp.zeros_like(start)] * (len(smooth) - len(parabola)))
+    return tuple(jnp.where(hold > 1.0, c, p) for c, p in zip(smooth, bent, strict=True))
+
+
+def following(series: Array) -> Array:
+    """Return a series `[time, ...]` one sample ahead; after its end it stays."""
+    return jnp.concatenate([series[1:], series[-1:]])
 
 
 def interpolated(values: Float[np.ndarray, " time"], place: Float[np.ndarray, " place"]) -> Float[np.ndarray, " place"]:
@@ -73,10 +102,6 @@ def continued(inputs: Float[np.ndarray, "time input"], count: int) -> Float[np.n
 def _quintic(inputs: Array) -> tuple[Array, ...]:
     """Return coefficients of the first to the fifth power of the fraction, `[time, input]` each (Hermite's)."""
     slope, curvature = _derivatives(inputs)
-
-    def following(series):
-        return jnp.concatenate([series[1:], series[-1:]])
-
     step, next_slope, next_curvature = following(inputs) - inputs, following(slope), following(curvature)
     return (
         slope,

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from ehsvjax import kernels
 from ehsvjax.checks import by_name, function, instance, number, whole
-from ehsvjax.holds import HOLDS, between, course
+from ehsvjax.holds import HOLDS, at_nodes, between, course, through_nodes
 from ehsvjax.integrators import repeated, scan_samples
 from ehsvjax.models.check import check_equations, where_not_finite
 from ehsvjax.models.model import Equations, Model, identity
@@ -207,28 +207,41 @@ def scan_model(
         the last carry, and what was kept, stacked `[time, ...]`.
 
     """
-    if equations.prepare is not None:
-        inputs = equations.prepare(parameters, inputs, sample_period)
-    periods = course(inputs, holds, grid.hold)
+    periods = course(inputs, holds, grid.hold), _prepared(equations, grid, parameters, inputs, holds, sample_period)
 
-    def named(row):
-        return dict(zip(equations.inputs, row, strict=True))
+    def inputs_at(here, fraction):
+        given, changed = here
+        every = dict(zip(equations.inputs, between(given, fraction), strict=True))
+        return every | {name: between(course, fraction) for name, course in changed.items()}
 
     def inputs_of(sample):
-        here, _ = sample
-        return lambda fraction: named(between(here, fraction))
+        return functools.partial(inputs_at, sample[0])
 
     def visit_state(carry, state, sample):
         here, rest = sample
-        return visit(carry, equations.measure(parameters, state, named(here[0]), signal), rest)
+        return visit(carry, equations.measure(parameters, state, inputs_at(here, 0.0), signal), rest)
 
     step = equations.stepper(parameters, sample_period / grid.substeps, signal)
-    state = equations.start(parameters, initial, named(inputs[0]))
+    first = jax.tree.map(lambda each: each[0], periods)
+    state = equations.start(parameters, initial, inputs_at(first, 0.0))
     # A state may start from Python numbers or from a float32 constant; the loop needs one type throughout. A count
     # stays one.
     state = jax.tree.map(lambda leaf: leaf if _is_count(leaf) else jnp.asarray(leaf, inputs.dtype), state)
     step = repeated(step, grid.substeps)
     return scan_samples(step, state, visit_state, carry, (periods, samples), inputs_of, scan)
+
+
+def _prepared(equations, grid, parameters, inputs, holds, sample_period) -> dict[str, tuple[Array, ...]]:
+    """Return the course of every input that the equations change as a whole, by name."""
+    if equations.prepare is None:
+        return {}
+    nodes = at_nodes(course(inputs, holds, grid.hold))
+    column = {name: i for i, name in enumerate(equations.inputs)}
+    changed = equations.prepare(parameters, {name: nodes[..., i] for name, i in column.items()}, sample_period)
+    return {
+        name: through_nodes(series, None if holds is None else holds[column[name]], grid.hold)
+        for name, series in changed.items()
+    }
 
 
 def _is_count(leaf) -> bool:

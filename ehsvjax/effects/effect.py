@@ -80,8 +80,8 @@ class Effect:
         parameters: its own numbers.
         apply: `apply(own, value, context)` returns the disturbed value; `own` are its numbers by name, `context` what
             the model passes with the signal and `time` s, `step_size` s, `duration` s of the record. With a memory:
-            `apply(own, value, context, memory)` returns the value and the new memory. For an input the value is the
-            whole series `[time]`.
+            `apply(own, value, context, memory)` returns the value and the new memory. For an input the value is all
+            that it does, `[time, node]`: at the start, in the middle and at the end of every sample period.
         needs: names of quantities that the context must hold; the effect is no candidate where it does not. One that
             needs the `time` is of its run: in each of several records it has amplitudes of its own.
         memory: what it remembers at the start, scalars; NaN is a good mark for "nothing yet". The memory moves on once

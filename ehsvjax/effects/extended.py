@@ -234,19 +234,21 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
 
     def prepare(parameters, series, sample_period):
         parameters = corrected(parameters)
-        series = series if base.prepare is None else base.prepare(parameters, series, sample_period)
-        time = sample_period * jnp.arange(series.shape[0], dtype=series.dtype)
-        context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
-        columns = dict(zip(names, jnp.moveaxis(series, -1, 0), strict=True))
+        changed = {} if base.prepare is None else base.prepare(parameters, series, sample_period)
         for name, effects in inputs.items():
+            course = changed.get(name, series[name])
+            samples = jnp.arange(len(course), dtype=course.dtype)
+            time = sample_period * jnp.stack([samples, samples + 0.5, samples + 1.0], axis=-1)
+            context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
 
-            def behind_effects(column, effects=effects):
+            def behind_effects(course, effects=effects, context=context):
                 for c in effects:
-                    column = c.effect.apply(own_of(c, parameters), column, context)
-                return (column,)
+                    course = c.effect.apply(own_of(c, parameters), course, context)
+                return (course,)
 
-            (columns[name],) = where_on(parameters, [name], behind_effects, columns[name])
-        return jnp.stack([columns[name] for name in names], axis=-1)
+            (course,) = where_on(parameters, [name], behind_effects, course)
+            changed = changed | {name: course}
+        return changed
 
     return base._replace(
         start=start, stepper=stepper, measure=measure, prepare=prepare if inputs else base.prepare, inputs=names

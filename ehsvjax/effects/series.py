@@ -1,9 +1,11 @@
-"""Effects on an input, as a whole series before it is simulated, and on a sensor."""
+"""Effects on an input, as a whole before it is simulated, and on a sensor."""
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, off_by_error, relative_error, size, width
+from ehsvjax.holds import following
 
 # Share by which what has been calibrated is usually off at most.
 _CALIBRATED = 0.05
@@ -36,48 +38,93 @@ def play(value, memory, half_width):
     return jnp.minimum(jnp.maximum(memory, value - half_width), value + half_width)
 
 
-def _delayed(own, series, context):
-    """Delay by any time, the mean over each sample of the held series; before the record it was zero."""
+def _gauss(count):
+    """Return points of a period with their weights, by which integrals over it are exact to power 2 count - 1."""
+    return [(0.5 + 0.5 * x, 0.5 * w) for x, w in zip(*np.polynomial.legendre.leggauss(count), strict=True)]
+
+
+def _legendre(fraction):
+    """Return the first three Legendre polynomials of a fraction of a period."""
+    middle = 2.0 * fraction - 1.0
+    return 1.0, middle, 1.5 * middle**2 - 0.5
+
+
+def _parabola(moments):
+    """Return the parabola `[time, node]` of every period that has three moments `[time]`, those by `_legendre`.
+
+    To a plant that does not turn far within a period, what is no parabola acts like this one: by the mean alone a
+    delay that is short beside the period is wrong by half of what it does.
+    """
+    mean, first, second = moments[0], 3.0 * moments[1], 5.0 * moments[2]
+    return jnp.stack([mean - first + second, mean - 0.5 * second, mean + first + second], axis=-1)
+
+
+def _delayed(own, course, context):
+    """Delay by any time; before the record it was zero."""
     samples = own["delay"] / context["sample_period"]
     whole = jnp.floor(samples)
     part = samples - whole
-    at = jnp.arange(series.shape[0]) - whole.astype(int)
+    # Every period holds the end of one that came before and the beginning of the next.
+    at = jnp.arange(-1, len(course)) - whole.astype(int)
+    earlier = jnp.where(at[:, None] >= 0, course[jnp.clip(at, 0, len(course) - 1)], 0.0)
 
-    def earlier(index):
-        inside = jnp.clip(index, 0, series.shape[0] - 1)
-        return jnp.where(index >= 0, series[inside], 0.0)
+    def moments(nodes, begins, length, arrives):
+        """Of a piece of a period, which begins at one fraction of that and arrives at one of the delayed."""
+        start, middle, end = nodes.T
+        found = [0.0, 0.0, 0.0]
+        for point, weight in _gauss(3):
+            f = begins + length * point
+            value = (2.0 * f - 1.0) * ((f - 1.0) * start + f * end) + 4.0 * f * (1.0 - f) * middle
+            orders = _legendre(arrives + length * point)
+            found = [so_far + length * weight * order * value for so_far, order in zip(found, orders, strict=True)]
+        return found
 
-    return (1.0 - part) * earlier(at) + part * earlier(at - 1)
+    pieces = moments(earlier[:-1], 1.0 - part, part, 0.0), moments(earlier[1:], 0.0, 1.0 - part, part)
+    return _parabola([before + after for before, after in zip(*pieces, strict=True)])
 
 
-def _between_steps(own, series, context):
-    """Mean over each sample of an input that runs from value to value instead of in steps: for share 1 straight."""
+def _between_steps(own, course, context):
+    """Run from value to value instead of in steps: for share 1 straight."""
     del context
-    following = jnp.concatenate([series[1:], series[-1:]])
-    return series + 0.5 * own["share"] * (following - series)
+    step = own["share"] * (following(course[:, 0]) - course[:, 0])
+    return course + jnp.stack([0.0 * step, 0.5 * step, step], axis=-1)
 
 
-def _lagged(own, series, context):
-    """First-order lag, the mean over each sample of what follows the held series; at rest before the record."""
+def _lagged(own, course, context):
+    """First-order lag of what is a straight line in every period; at rest before the record."""
     ratio = context["sample_period"] / jnp.maximum(own["time_constant"], 1e-6 * context["sample_period"])
     decay = jnp.exp(-ratio)
-    share = (1.0 - decay) / ratio
+    # Moments of exp(-ratio * fraction) by parts; where differences would be lost in rounding, by quadrature.
+    mean = -jnp.expm1(-ratio) / ratio
+    first = (2.0 * mean - 1.0 - decay) / ratio
+    second = mean + 6.0 * first / ratio
+    slow = jnp.minimum(ratio, 1.0)
+    at_points = [[weight * jnp.exp(-slow * point) * order for order in _legendre(point)] for point, weight in _gauss(5)]
+    _, *by_points = map(sum, zip(*at_points, strict=True))
+    first, second = (jnp.where(ratio < 1.0, *both) for both in zip(by_points, (first, second), strict=True))
 
-    def follow(level, target):
-        return target + (level - target) * decay, target + (level - target) * share
+    # What follows a straight line is that line, later by the time constant, but for what decays.
+    start, middle, end = course.T
+    slope = end - start
+    line = (start + 4.0 * middle + end) / 6.0 - 0.5 * slope - slope / ratio
 
-    lagging = lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
-    return jnp.where(own["time_constant"] > 0.0, lagging, series)
+    def follow(level, here):
+        line, slope = here
+        return line + slope + (level - line) * decay, level - line
+
+    off = lax.scan(follow, jnp.zeros((), course.dtype), (line, slope))[1]
+    lagging = _parabola([line + 0.5 * slope + off * mean, slope / 6.0 + off * first, off * second])
+    return jnp.where(own["time_constant"] > 0.0, lagging, course)
 
 
-def _play_along(own, series, context):
+def _play_along(own, course, context):
     del context
 
-    def follow(level, target):
-        level = play(target, level, own["half_width"])
-        return level, level
+    def follow(level, nodes):
+        levels = [level := play(target, level, own["half_width"]) for target in nodes]
+        return level, jnp.stack(levels)
 
-    return lax.scan(follow, jnp.zeros((), series.dtype), series)[1]
+    return lax.scan(follow, jnp.zeros((), course.dtype), course)[1]
 
 
 def _sensor_lag(own, value, context, memory):

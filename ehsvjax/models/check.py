@@ -83,7 +83,7 @@ def _checked(
 
     with jax.enable_x64(True):
         scalar = jax.ShapeDtypeStruct((), jnp.float64)
-        series = jax.ShapeDtypeStruct((_SAMPLES, len(equations.inputs)), jnp.float64)
+        series = dict.fromkeys(equations.inputs, jax.ShapeDtypeStruct((_SAMPLES, 3), jnp.float64))
         names = (parameters, initial, equations.inputs)
         jax.eval_shape(whole, *(dict.fromkeys(n, scalar) for n in names), series, scalar)
     for name, kind in kinds.items():
@@ -121,10 +121,12 @@ def one_step(
     run = functools.partial(_run, model)
     if equations.prepare is not None:
         prepared = run(equations.prepare, parameters, series, step_size)
-        if np.shape(prepared) != np.shape(series):
+        if not isinstance(prepared, dict) or any(
+            name not in series or np.shape(prepared[name]) != np.shape(series[name]) for name in prepared
+        ):
             raise ValueError(
-                f"expected {name_of(equations.prepare)} of {model} to return the inputs [time, input] in the shape in "
-                f"which they came, {np.shape(series)}, got {in_words(prepared)}"
+                f"expected {name_of(equations.prepare)} of {model} to return inputs by name, [time, node] in the shape "
+                f"in which they came, got {in_words(prepared)}"
             )
 
     state = run(equations.start, parameters, initial, inputs)

@@ -12,7 +12,9 @@ there. In `step`, `inputs(fraction)` gives the inputs at that fraction of the st
 diagram that physics could disturb passes through `signal(name, value, **context)`, the identity of the nominal model;
 the context is what an effect there may depend on (a force: `position=`, `velocity=`).
 
-A fourth, `prepare(parameters, inputs, sample_period) -> inputs`, may change the whole series of an input beforehand.
+A fourth, `prepare(parameters, inputs, sample_period) -> changed`, may change inputs as a whole beforehand: by name,
+what they are at the start, in the middle and at the end of every sample period, `[time, node]`; it returns those that
+are others then.
 """
 
 import difflib
