@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.checks import instance
 from ehsvjax.correlations import Correlation, with_input, with_itself
 from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
@@ -337,6 +338,94 @@ def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
     return figure
 
 
+def plot_corner(
+    estimates: Mapping[str, float],
+    units: Mapping[str, str],
+    covariance: Float[np.ndarray, "parameter parameter"],
+    draws: Mapping[str, Float[np.ndarray, " draw"]] | None = None,
+    profiles: "ProfileLikelihood | None" = None,
+) -> "matplotlib.figure.Figure":
+    """Draw what is known of parameters, by pairs and one by one.
+
+    Args:
+        estimates: name -> value, SI.
+        units: name -> unit.
+        covariance: by linear theory, SI, in the order of the estimates; NaN where it says nothing.
+        draws: name -> values of a bootstrap, SI.
+        profiles: of some of them.
+
+    Raises:
+        ValueError: for profiles that are none, or of none of these parameters.
+
+    """
+    from ehsvjax.precision import ProfileLikelihood
+
+    names = list(estimates)
+    if profiles is not None:
+        instance("profiles", profiles, ProfileLikelihood, "pass fit.profile_likelihood()")
+        if not set(names) & set(profiles.profiles):
+            raise ValueError(f"expected profiles of {', '.join(names)}, got {', '.join(profiles.profiles)}")
+    drawn_in = {name: _to_order_of_one(estimates[name], units[name]) for name in names}
+    values = {name: each / drawn_in[name][0] for name, each in ({} if draws is None else draws).items()}
+    count = len(names)
+    with _style():
+        figure = _figure(width=1.5 * count + 1.2, height=1.5 * count + 0.8)
+        grid = figure.subplots(count, count, squeeze=False, sharex="col")
+        for i, j in itertools.product(range(count), repeat=2):
+            axes, below, left = grid[i, j], names[j], names[i]
+            if j > i:
+                axes.set_visible(False)
+                continue
+            axes.ticklabel_format(style="plain", useOffset=False)
+            axes.xaxis.get_major_locator().set_params(nbins=3)
+            factors = np.array([drawn_in[below][0], drawn_in[left][0]])
+            spread = covariance[np.ix_([j, i], [j, i])] / np.outer(factors, factors)
+            centre = np.array([estimates[below], estimates[left]]) / factors
+            if i == j:
+                profile = None if profiles is None else profiles.profiles.get(below)
+                _draw_alone(axes, values.get(below), centre[0], spread[0, 0], profile, factors[0])
+            else:
+                if values:
+                    axes.plot(values[below], values[left], ls="", marker=".", ms=3, color=_MEASURED, alpha=0.6)
+                axes.plot(*_ellipse(centre, spread), color=_COMMAND)
+                axes.plot(*centre, marker="+", ms=8, color=_TRUE)
+                axes.yaxis.get_major_locator().set_params(nbins=3)
+                axes.tick_params(labelleft=j == 0)
+            if i == count - 1:
+                axes.set_xlabel(f"{_words(below)}\n{drawn_in[below][1]}")
+            if j == 0 < i:
+                axes.set_ylabel(f"{_words(left)}\n{drawn_in[left][1]}")
+        handles, labels = grid[0, 0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="upper right")
+    return figure
+
+
+def _draw_alone(axes, values, estimate: float, variance: float, profile, factor: float) -> None:
+    """Draw the density of one parameter: of its draws, of linear theory, and the likelihood of its profile."""
+    axes.set_yticks([])
+    if values is not None:
+        axes.hist(values, bins="auto", density=True, color=_MEASURED, alpha=0.6, label="bootstrap")
+    reach = np.linspace(-3.5, 3.5, 141)
+    if variance > 0.0:
+        deviation = math.sqrt(variance)
+        bell = np.exp(-0.5 * reach**2) / (math.sqrt(2.0 * math.pi) * deviation)
+        axes.plot(estimate + deviation * reach, bell, color=_COMMAND, label="linear theory (95% ellipse)")
+    if profile is not None:
+        at = np.linspace(profile.values[0], profile.values[-1], 141) / factor
+        likelihood = np.exp(-0.5 * np.interp(at, profile.values / factor, profile.signed_root) ** 2)
+        axes.plot(at, likelihood / np.trapezoid(likelihood, at), color=_MODEL, label="profile likelihood")
+
+
+def _ellipse(centre, covariance, level: float = 0.95):
+    """Return the curve of two parameters that holds them by linear theory; none where that says nothing of them."""
+    if not np.isfinite(covariance).all():
+        return [], []
+    variances, axes = np.linalg.eigh(covariance)
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    size = np.sqrt(-2.0 * math.log(1.0 - level) * np.maximum(variances, 0.0))
+    return centre[:, None] + (axes * size) @ np.stack([np.cos(angle), np.sin(angle)])
+
+
 def plot_pressure_flow() -> "matplotlib.figure.Figure":
     """Draw the normalised pressure-flow curves of a critical-centre valve: figure 1 of the paper."""
     openings = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
@@ -489,6 +578,16 @@ def _scaled(values, unit: str) -> tuple[float, str]:
     finite = np.abs(values[np.isfinite(values)])
     prefix = _prefix(float(np.max(finite, initial=0.0)), unit)
     return _PREFIXES[prefix], _plain(f"({prefix}{unit})") if unit else "(–)"
+
+
+def _to_order_of_one(value: float, unit: str) -> tuple[float, str]:
+    """Return as `_scaled` does; where no prefix helps, a power of ten stands in the label instead of at the axis."""
+    factor, label = _scaled(np.array([value]), unit)
+    size = abs(value) / factor
+    if not 0.0 < size < math.inf or 1e-3 <= size < 1e4:
+        return factor, label
+    power = math.floor(math.log10(size))
+    return factor * 10.0**power, f"($10^{{{power}}}$ {_plain(unit)})"
 
 
 def _words(name: str) -> str:

@@ -125,9 +125,13 @@ def test_bands_are_infinite_where_the_simulation_fails():
 
 
 def test_refits_that_all_fail_leave_nothing_known():
-    lost = Bootstrap({"rate": np.zeros(0), "gain": np.ones(1)}, {"rate": -1.0, "gain": 1.0}, 3)
+    units = {"rate": "1/s", "gain": ""}
+    lost = Bootstrap({"rate": np.zeros(0), "gain": np.ones(1)}, {"rate": -1.0, "gain": 1.0}, 3, units, np.eye(2))
     assert lost.standard_errors == {"rate": np.inf, "gain": np.inf}
     assert lost.intervals() == {"rate": (-np.inf, np.inf), "gain": (-np.inf, np.inf)}
+    assert "rate  -1 +/- not known  1/s" in str(lost) and "3 more refits failed" in str(lost)
+    with pytest.raises(ValueError, match="expected two refits that converged, got fewer: draw more"):
+        lost.plot()
 
 
 def test_a_profile_says_what_could_not_be_simulated():

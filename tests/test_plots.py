@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 
+import jax
 import matplotlib.pyplot
 import numpy as np
 import pytest
@@ -188,6 +189,8 @@ def test_any_name_is_drawn_letter_by_letter():
         "fit": fit.plot(),
         "identification": plot_identification(fit, {fit.outputs[0]: TRUE_FORCE}),
         "profiles": fit.profile_likelihood().plot(),
+        "precision": fit.precision().plot(),
+        "bootstrap": fit.bootstrap(jax.random.key(0), draws=4).plot(fit.profile_likelihood()),
     }
     for name, figure in figures.items():
         assert to_png(figure, 30.0).startswith(b"\x89PNG"), name
@@ -201,6 +204,7 @@ def test_any_name_is_printed_on_its_line():
     assert all(line.startswith(("[[", "    ")) for line in text.splitlines())
     assert "&lt;b&gt;" in fit._repr_html_()
     assert str(fit.profile_likelihood()).count("\n") == 1
+    assert str(fit.bootstrap(jax.random.key(0), draws=4)).count("\n") == 1
 
 
 def test_a_history_that_failed_at_first_is_drawn():

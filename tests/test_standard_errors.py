@@ -6,6 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from matplotlib.path import Path
 from scipy.linalg import toeplitz
 from scipy.optimize import curve_fit
 from scipy.signal import lfilter
@@ -174,6 +175,27 @@ def test_bootstrap_has_the_errors_of_the_closed_form(kind, pole):
     low, high = drawn.intervals()["gain"]
     assert low < fit.parameters["gain"] < high
     assert high - low == pytest.approx(2 * 1.96 * drawn.standard_errors["gain"], rel=0.2)
+
+
+def test_a_corner_plot_shows_the_draws_with_linear_theory_and_profiles():
+    model = _line().with_bounds({"offset": (-50.0, 50.0)})
+    options = {"population": 16, "generations": 12, "initial": {"start": 0.4}}
+    fit = ehsvjax.identify(model, _record(_noise(5)), key=jax.random.key(0), **options)
+    drawn = fit.bootstrap(jax.random.key(2), draws=300)
+    assert str(drawn).startswith("[[Bootstrap, 300 draws, 95% intervals]]\n    gain ")
+    figure = drawn.plot(fit.profile_likelihood())
+    alone, _, pair, _ = figure.axes
+    draws, ellipse, _ = pair.lines
+    inside = Path(ellipse.get_xydata()).contains_points(draws.get_xydata())
+    # 95% of 300 draws, with a deviation of 1.3%.
+    assert 0.9 < inside.mean() < 0.995
+    bell, profile = (np.interp(fit.parameters["gain"], *line.get_data()) for line in alone.lines)
+    assert profile == pytest.approx(bell, rel=0.02)
+    # Of a plan there are no draws.
+    planned = ehsvjax.design(model, fit.records, noise_variance={"y": 0.01}, initial={"start": 0.4}).plot()
+    assert [len(axes.lines) for axes in planned.axes] == [1, 0, 2, 1]
+    with pytest.raises(ValueError, match="expected profiles to be"):
+        drawn.plot(fit)
 
 
 def test_blocks_of_a_record_that_lacks_an_output():

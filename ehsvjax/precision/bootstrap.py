@@ -2,7 +2,7 @@
 
 import warnings
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ from ehsvjax.precision.residual_noise import ResidualNoise
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.refine import refine
 
+if TYPE_CHECKING:
+    from ehsvjax.precision.profile import ProfileLikelihood
+
 # Draws that are refitted side by side.
 _TOGETHER = 32
 
@@ -29,12 +32,17 @@ class Bootstrap(NamedTuple):
         parameters: name -> `[draw]`, SI, of the refits that converged.
         estimates: name -> value of the fit itself, SI.
         lost: how many refits did not converge, and are left out.
+        units: name -> unit.
+        covariance: `[free, free]` by linear theory, SI, in the order of `parameters`; NaN where it says
+            nothing.
 
     """
 
     parameters: dict[str, Float[np.ndarray, " draw"]]
     estimates: dict[str, float]
     lost: int
+    units: dict[str, str]
+    covariance: Float[np.ndarray, "free free"]
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -65,6 +73,33 @@ class Bootstrap(NamedTuple):
             found[name] = (float(2.0 * self.estimates[name] - high), float(2.0 * self.estimates[name] - low))
         return found
 
+    def plot(self, profiles: "ProfileLikelihood | None" = None):
+        """Draw every pair of parameters and every one by itself; returns the matplotlib figure.
+
+        The draws, the ellipse or the bell of linear theory, and the profile likelihood where it is handed over.
+
+        Raises:
+            ValueError: for profiles that are none, or of none of these parameters, or where too few refits converged.
+
+        """
+        from ehsvjax.plots import plot_corner
+
+        if len(next(iter(self.parameters.values()))) < 2:
+            raise ValueError("expected two refits that converged, got fewer: draw more, or look why the fit fails")
+        return plot_corner(self.estimates, self.units, self.covariance, self.parameters, profiles)
+
+    def __str__(self) -> str:
+        """Return a line for each parameter."""
+        draws = len(next(iter(self.parameters.values())))
+        lines = [f"[[Bootstrap, {draws} draws, 95% intervals]]"]
+        width, errors = max(map(len, self.parameters)), self.standard_errors
+        for name, (lower, upper) in self.intervals().items():
+            known = f"{errors[name]:.2g}  {lower:.6g} .. {upper:.6g}" if len(self.parameters[name]) > 1 else "not known"
+            lines.append(f"    {name:<{width}}  {self.estimates[name]:.6g} +/- {known}  {self.units[name]}".rstrip())
+        if self.lost:
+            lines.append(f"    {self.lost} more refits failed or did not converge, and are left out")
+        return "\n".join(lines)
+
 
 def bootstrap(
     problem: Problem,
@@ -76,6 +111,8 @@ def bootstrap(
     key: Key[Array, ""],
     draws: int,
     kind: str,
+    units: dict[str, str],
+    covariance: Float[np.ndarray, "free free"],
 ) -> Bootstrap:
     """Refit drawn records, from the fit's own values on.
 
@@ -89,6 +126,8 @@ def bootstrap(
         draws: how many.
         kind: "parametric" draws Gaussian noise of the residuals' own colour; "block" puts blocks of the residuals
             themselves together anew (Kunsch 1989), longer than the noise is correlated.
+        units: name -> unit, of every parameter.
+        covariance: of the parameters by linear theory, SI.
 
     Raises:
         ValueError: for an unknown kind, or fewer than 2 draws.
@@ -129,6 +168,8 @@ def bootstrap(
         {name: refitted[good, i] for i, name in enumerate(problem.free)},
         {name: float(values[i]) for i, name in enumerate(problem.free)},
         int(np.sum(~good)),
+        units,
+        covariance,
     )
 
 

@@ -92,10 +92,23 @@ def profiles(fit: Fit, of: Prepared, names: Sequence[str] | None, level: float) 
 
 def draws(fit: Fit, of: Prepared, key: Key[Array, ""], count: int, kind: str) -> Bootstrap:
     """Return the bootstrap."""
-    found, noises, *_ = of.first_order
+    found, noises = of.first_order.found, of.first_order.noises
     assert noises is not None
     variance = _sample_variance(fit, of)
-    return bootstrap(of.problem, of.values, found.simulated, noises, variance, key=key, draws=count, kind=kind)
+    free = slice(len(of.problem.free))
+    told = np.where(of.first_order.seen, found.scale, np.nan)[free]
+    return bootstrap(
+        of.problem,
+        of.values,
+        found.simulated,
+        noises,
+        variance,
+        key=key,
+        draws=count,
+        kind=kind,
+        units={name: fit.model.parameter(name).unit for name in of.problem.free},
+        covariance=of.first_order.covariance[free, free] * np.outer(told, told),
+    )
 
 
 def bands(fit: Fit, of: Prepared, record: Record, initial, level: float) -> dict[str, Band]:

@@ -78,6 +78,12 @@ class Precision:
                 found[name] = (value - reach, value + reach)
         return found
 
+    def plot(self):
+        """Draw the ellipse of every pair of parameters that holds them with 95%; returns the matplotlib figure."""
+        from ehsvjax.plots import plot_corner
+
+        return plot_corner(self.values, self.units, self.covariance)
+
     def __str__(self) -> str:
         """Return the table of parameters, correlations above 0.5, and what is not fixed."""
         from ehsvjax.summary import precision_summary
