@@ -13,23 +13,37 @@ compiles it by default, 11 in one kernel, 3.5 with shared values stored too; Van
 
 A long function takes long to compile: `jit` asks XLA, for one program at a time, for the way that is sooner done.
 
-On other platforms, and where a model uses an operation that such a function cannot hold (a sort, a matrix
-decomposition), everything here is the identity.
+On other platforms, where a model uses an operation that such a function cannot hold (a sort, a matrix decomposition),
+and where a JAX of the future lacks what this takes from its experimental parts, everything here is the identity. So it
+is where the environment variable EHSVJAX_PLAIN_KERNELS is set, to find out whether a fault is in here.
 """
 
 import functools
+import os
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 from jaxtyping import Array, Float
 
+try:
+    from jax.experimental.xla_metadata import set_xla_metadata
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+
+    _PLAIN = "EHSVJAX_PLAIN_KERNELS is set" if os.environ.get("EHSVJAX_PLAIN_KERNELS") else ""
+except ImportError as _missing:
+    ClosedJaxpr = Jaxpr = JaxprEqn = Literal = Var = Any  # type: ignore[assignment, misc]
+    _PLAIN = f"JAX {jax.__version__} lacks a part ({_missing})"
+if _PLAIN:
+    warnings.warn(
+        f"{_PLAIN}: time loops run as XLA compiles them by itself, right but several times slower", stacklevel=1
+    )
+
 # Known to the XLA of these versions of JAX; another would refuse an option that it does not know.
-_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else None
+_OPTIONS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) and not _PLAIN else None
 
 # What recomputing a value may cost before it is stored, in operations: a store and its loads take about as long.
 _WORTH_STORING = 8
@@ -97,7 +111,7 @@ def one_kernel(function: Callable) -> Callable:
 
     def called(*args):
         # The call is traced once, for the question and for the use.
-        if not _on_cpu() or not _compiles_inside(jax.make_jaxpr(compiled)(*args).jaxpr):
+        if not _shaped() or not _compiles_inside(jax.make_jaxpr(compiled)(*args).jaxpr):
             return function(*args)
         # XLA aborts on a kernel with a parameter that nothing reads; the call inside reads them all.
         return _outlined(jax.jit(_outlined(compiled)), xla_cpu_small_call="true")(*args)
@@ -116,7 +130,7 @@ def in_blocks(function: Callable, rows: Float[Array, "individual parameter"]) ->
     The last row is repeated to fill the last block.
     """
     count = len(rows)
-    if not _on_cpu() or count == 1:
+    if not _shaped() or count == 1:
         return one_kernel(function)(rows)
     blocks = -(-count // _BLOCK)
     width = -(-count // (blocks * VECTOR)) * VECTOR
@@ -141,7 +155,7 @@ def scan(body: Callable, carry: Any, samples: Any) -> tuple[Any, Any]:
     """
     kept = jax.eval_shape(lambda carry, samples: lax.scan(body, carry, samples)[1], carry, samples)
     whole = one_kernel(lambda carry, samples: lax.scan(body, carry, samples))
-    if not _on_cpu() or not jax.tree.leaves(kept):
+    if not _shaped() or not jax.tree.leaves(kept):
         return whole(carry, samples)
     count = len(jax.tree.leaves(kept)[0])
     size = max((n for n in range(8, _STORED_TOGETHER + 1) if count % n == 0), default=_STORED_TOGETHER)
@@ -161,7 +175,7 @@ def stored_once(function: Callable) -> Callable:
     """
 
     def called(*args):
-        if not _on_cpu():
+        if not _shaped():
             return function(*args)
         leaves, structure = jax.tree.flatten(args)
         traced, results = jax.make_jaxpr(
@@ -175,7 +189,10 @@ def stored_once(function: Callable) -> Callable:
     return called
 
 
-def _on_cpu() -> bool:
+def _shaped() -> bool:
+    """Whether anything is done here: on the CPU, with a JAX that has what it takes."""
+    if _PLAIN:
+        return False
     device = jax.config.jax_default_device  # type: ignore[attr-defined]
     platform = getattr(device, "platform", device) or jax.default_backend()
     return platform == "cpu"

@@ -1,6 +1,9 @@
 """What makes loops fast must change nothing: against the same functions without it, and against NumPy."""
 
 import functools
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -179,3 +182,35 @@ def test_device_that_the_user_chose_is_heeded():
     assert kernels._on_cpu()
     with jax.default_device(jax.devices("cpu")[0]):
         assert kernels._on_cpu()
+
+
+_IN_ANOTHER_PROCESS = """
+import sys, warnings
+if "lacking" in sys.argv:
+    sys.modules["jax.experimental.xla_metadata"] = None
+with warnings.catch_warnings(record=True) as said:
+    warnings.simplefilter("always")
+    import jax, numpy as np
+    import ehsvjax
+    from ehsvjax import kernels
+    model = ehsvjax.van_der_pol()
+    record = ehsvjax.Record(0.05 * np.arange(200), {"command": np.sin(np.arange(200.0) // 20)})
+    position = ehsvjax.simulate(model, record)["position"]
+    record = ehsvjax.Record(record.time, record.inputs, {"position": position + 0.01 * np.cos(7.0 * np.arange(200))})
+    fit = ehsvjax.identify(model, record, key=jax.random.key(0), population=16, generations=4)
+print(sum("as XLA compiles them by itself" in str(w.message) for w in said))
+print(repr(fit.cost))
+"""
+
+
+def test_without_the_kernels_all_is_the_same_but_slower():
+    def run(*arguments, **environment):
+        command = [sys.executable, "-c", _IN_ANOTHER_PROCESS, *arguments]
+        done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+        return done.stdout.split()
+
+    warned, cost = run()
+    assert warned == "0"
+    for plain in (run("lacking"), run(EHSVJAX_PLAIN_KERNELS="1")):
+        assert plain[0] == "1"
+        assert float(plain[1]) == pytest.approx(float(cost), rel=1e-6)
