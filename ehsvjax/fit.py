@@ -17,6 +17,7 @@ from ehsvjax.score import Score, differences, score_of
 from ehsvjax.simulate import simulate
 
 if TYPE_CHECKING:
+    import matplotlib.figure
     import pandas
     from jaxtyping import Array, Key
 
@@ -398,7 +399,7 @@ class Fit:
 
         return simulation_table(self, self.records[0] if record is None else record, initial)
 
-    def plot(self, record: Record | None = None):
+    def plot(self, record: Record | None = None) -> "matplotlib.figure.Figure":
         """Draw measured against simulated, the residual, and the cost by generation; returns the matplotlib figure.
 
         Args:
@@ -409,7 +410,7 @@ class Fit:
 
         return plot_fit(self, self.records[0] if record is None else record)
 
-    def plot_residuals(self, record: Record | None = None):
+    def plot_residuals(self, record: Record | None = None) -> "matplotlib.figure.Figure":
         """Draw what is left: its correlations with itself and with every input, with bands, its values, its power.
 
         Args:

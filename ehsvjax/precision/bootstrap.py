@@ -19,6 +19,8 @@ from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.refine import refine
 
 if TYPE_CHECKING:
+    import matplotlib.figure
+
     from ehsvjax.precision.profile import ProfileLikelihood
 
 # Draws that are refitted side by side.
@@ -73,7 +75,7 @@ class Bootstrap(NamedTuple):
             found[name] = (float(2.0 * self.estimates[name] - high), float(2.0 * self.estimates[name] - low))
         return found
 
-    def plot(self, profiles: "ProfileLikelihood | None" = None):
+    def plot(self, profiles: "ProfileLikelihood | None" = None) -> "matplotlib.figure.Figure":
         """Draw every pair of parameters and every one by itself; returns the matplotlib figure.
 
         The draws, the ellipse or the bell of linear theory, and the profile likelihood where it is handed over.

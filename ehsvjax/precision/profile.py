@@ -5,7 +5,7 @@ Unlike a standard error the interval follows a cost that is no parabola, and it 
 
 import warnings
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,9 @@ from jaxtyping import Bool, Float
 from ehsvjax.population import Problem, cast, to_unit, to_values
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.refine import refine
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 # Standard errors at which the parameter is held, on either side; farther in the next round where that is too near.
 _DISTANCES = np.array([0.7, 1.4, 2.1, 2.8])
@@ -64,7 +67,7 @@ class ProfileLikelihood(NamedTuple):
         """Name -> (lower, upper), SI."""
         return {name: profile.interval for name, profile in self.profiles.items()}
 
-    def plot(self):
+    def plot(self) -> "matplotlib.figure.Figure":
         """Draw every profile with its interval, and what the standard error says; returns the matplotlib figure."""
         from ehsvjax.plots import plot_profiles
 

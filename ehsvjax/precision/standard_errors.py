@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -24,6 +24,9 @@ from ehsvjax.precision.directions import (
 from ehsvjax.precision.remedies import unfixed_directions
 from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, absorbed_by_the_fit, meat, residual_noise
 from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, check_finite, sensitivities
+
+if TYPE_CHECKING:
+    import matplotlib.figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +81,7 @@ class Precision:
                 found[name] = (value - reach, value + reach)
         return found
 
-    def plot(self):
+    def plot(self) -> "matplotlib.figure.Figure":
         """Draw the ellipse of every pair of parameters that holds them with 95%; returns the matplotlib figure."""
         from ehsvjax.plots import plot_corner
 

@@ -20,6 +20,7 @@ from ehsvjax.models.model import Model
 from ehsvjax.record import Record
 
 if TYPE_CHECKING:
+    import matplotlib.figure
     import pandas
     from jaxtyping import Array, Key
 
@@ -109,7 +110,7 @@ class Diagnosis:
 
     __repr__ = __str__
 
-    def plot(self):
+    def plot(self) -> "matplotlib.figure.Figure":
         """Draw the misfit, the suspects, what the extended model leaves; returns the matplotlib figure."""
         from ehsvjax.diagnosis.results.pictures import plot_diagnosis
 
