@@ -17,29 +17,41 @@ conditions included), generation, time (a sample), signal (an output). SI units 
 
 from ehsvjax import effects, excitation, hydraulics, operators
 from ehsvjax.columns import Column
-from ehsvjax.comparison import compare
-from ehsvjax.diagnosis import diagnose
+from ehsvjax.comparison import Comparison, compare
+from ehsvjax.diagnosis import Diagnosis, diagnose
 from ehsvjax.effects import Effect
-from ehsvjax.experiment import Limits, next_experiment
+from ehsvjax.experiment import Limits, Plan, next_experiment
 from ehsvjax.fit import Fit
 from ehsvjax.genetic import Operators
 from ehsvjax.identify import identify
+from ehsvjax.inspection import Inspection
 from ehsvjax.integrators import runge_kutta_4
-from ehsvjax.linear import linearise
+from ehsvjax.linear import LinearModel, linearise
 from ehsvjax.models import Model, Parameter, Signal, servovalve, van_der_pol
-from ehsvjax.precision import cramer_rao_bound, design
+from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood, cramer_rao_bound, design
 from ehsvjax.record import Record
+from ehsvjax.score import Score
 from ehsvjax.simulate import simulate
 
 __all__ = [
+    "Band",
+    "Bootstrap",
     "Column",
+    "Comparison",
+    "Diagnosis",
     "Effect",
     "Fit",
+    "Inspection",
     "Limits",
+    "LinearModel",
     "Model",
     "Operators",
     "Parameter",
+    "Plan",
+    "Precision",
+    "ProfileLikelihood",
     "Record",
+    "Score",
     "Signal",
     "compare",
     "cramer_rao_bound",

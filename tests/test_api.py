@@ -2,11 +2,14 @@
 
 import ast
 import importlib
+import importlib.metadata
 import inspect
 import json
 import pkgutil
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -74,6 +77,22 @@ from jax._src import xla_bridge
 print(json.dumps({"heavy": heavy, "changed": [k for k, v in jax.config.values.items() if before[k] != v],
                   "backends": bool(xla_bridge._backends)}))
 """
+
+
+def test_whatever_is_imported_is_declared():
+    """Also what another dependency happens to bring along."""
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    named = [*project["dependencies"], *project["optional-dependencies"]["files"]]
+    declared = {re.split(r"[><=\[ ]", requirement)[0].lower() for requirement in named}
+    found = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module and not node.level else []
+            found |= {name.partition(".")[0] for name in names}
+    brought_by = importlib.metadata.packages_distributions()
+    others = found - set(sys.stdlib_module_names) - {"ehsvjax"}
+    assert {name for name in others if not declared & {d.lower() for d in brought_by[name]}} == set()
 
 
 def test_importing_is_cheap_and_changes_nothing():

@@ -10,10 +10,7 @@ import pandas as pd
 from scipy.signal import StateSpace
 
 import ehsvjax
-from ehsvjax.diagnosis import Diagnosis
 from ehsvjax.effects import BANK, attach, effects_of
-from ehsvjax.experiment import Plan
-from ehsvjax.precision import Band, Bootstrap, Precision, ProfileLikelihood
 
 
 def records(folder: Path) -> list[ehsvjax.Record]:
@@ -41,10 +38,10 @@ def fitted(some: list[ehsvjax.Record]) -> ehsvjax.Fit:
     fit = ehsvjax.identify(
         model, some, key=jax.random.key(0), start={"flow_gain": 1e-4}, operators=ehsvjax.Operators(), progress=False
     )
-    precision: Precision = fit.precision()
-    profiles: ProfileLikelihood = fit.profile_likelihood()
-    draws: Bootstrap = fit.bootstrap(jax.random.key(1))
-    bands: dict[str, Band] = fit.bands(some[0])
+    precision: ehsvjax.Precision = fit.precision()
+    profiles: ehsvjax.ProfileLikelihood = fit.profile_likelihood()
+    draws: ehsvjax.Bootstrap = fit.bootstrap(jax.random.key(1))
+    bands: dict[str, ehsvjax.Band] = fit.bands(some[0])
     figures: list[matplotlib.figure.Figure] = [
         fit.plot(), fit.plot_residuals(), precision.plot(), profiles.plot(), draws.plot(profiles),
         ehsvjax.compare([fit], some).plot(),
@@ -55,7 +52,7 @@ def fitted(some: list[ehsvjax.Record]) -> ehsvjax.Fit:
     linear = fit.linearise({"command": 2e-3})
     system: StateSpace = linear.system
     bound: dict[str, float] = ehsvjax.cramer_rao_bound(model, some, noise_variance={"position": 1e-8})
-    planned: Precision = ehsvjax.design(model, some, noise_variance={"position": 1e-8})
+    planned: ehsvjax.Precision = ehsvjax.design(model, some, noise_variance={"position": 1e-8})
     fit.save("fit.npz")
     del bands, figures, table, series, simulated, system, bound, planned
     return ehsvjax.Fit.load("fit.npz")
@@ -63,7 +60,7 @@ def fitted(some: list[ehsvjax.Record]) -> ehsvjax.Fit:
 
 def diagnosed(fit: ehsvjax.Fit, some: list[ehsvjax.Record]) -> ehsvjax.Record:
     """Find what is wrong, and what to do next."""
-    diagnosis: Diagnosis = ehsvjax.diagnose(fit, some, key=jax.random.key(2), bank=BANK)
+    diagnosis: ehsvjax.Diagnosis = ehsvjax.diagnose(fit, some, key=jax.random.key(2), bank=BANK)
     figure: matplotlib.figure.Figure = diagnosis.plot()
     diagnosis.report("diagnosis.html")
     better: ehsvjax.Fit | None = diagnosis.extended
@@ -72,7 +69,9 @@ def diagnosed(fit: ehsvjax.Fit, some: list[ehsvjax.Record]) -> ehsvjax.Record:
         probability: float = cause.probability
         del name, probability
     limits = ehsvjax.Limits(command=(-8e-3, 8e-3), position=(-0.1, 0.1), duration=5.0)
-    plan: Plan = diagnosis.next_experiment(limits, key=jax.random.key(3), can_change={"supply_pressure": (70e5, 210e5)})
+    plan: ehsvjax.Plan = diagnosis.next_experiment(
+        limits, key=jax.random.key(3), can_change={"supply_pressure": (70e5, 210e5)}
+    )
     drawn: matplotlib.figure.Figure = plan.plot()
     diagnosis.save("diagnosis.npz")
     del figure, better, drawn
