@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.checks import as_number, file_path, flag, instance, refused, shown
+from ehsvjax.checks import as_number, file_path, flag, instance, number, refused, shown
 from ehsvjax.columns import Column, pick, unknown_name, vector
 from ehsvjax.files import written_whole
 from ehsvjax.holds import WORDS, interpolated
@@ -140,6 +140,38 @@ class Record:
                 f"got at={shown(at)} and fraction={shown(fraction)}"
             )
         return self._cut(0, middle), self._cut(middle, len(self))
+
+    def stretches(self, condition: Any, *, shortest: float = 0.0, bridged: float = 0.0) -> list["Record"]:
+        """Take every stretch in which a condition holds, `[time]` of true and false, as a record of its own.
+
+        Strokes one by one, `record.stretches(record.inputs["command"] > 0.0)`, or all but the rests. Interruptions of
+        up to `bridged` s, as by a spike, do not end a stretch; those of less than `shortest` s, or of fewer than two
+        samples, are left out.
+
+        Raises ValueError for a condition that is none, times that are no positive numbers or zero, and where no stretch
+        is long enough.
+        """
+        holds = np.asarray(condition)
+        if holds.shape != (len(self),) or holds.dtype != bool:
+            remedy = 'compare a series with a value: record.inputs["command"] > 0.0'
+            raise refused("condition", f"true or false at each of the {len(self)} samples", condition, remedy)
+        for name, value in (("shortest", shortest), ("bridged", bridged)):
+            number(name, value, "zero or more seconds", lambda x: x >= 0.0)
+        # Where it begins to hold and where it ends, in pairs.
+        edges = np.flatnonzero(np.diff(holds, prepend=False, append=False)).reshape(-1, 2)
+        until = np.append(self.time, self.time[-1] + self.duration / (len(self) - 1))
+        apart = until[edges[1:, 0]] - until[edges[:-1, 1]] > bridged * (1.0 + TOLERANCE)
+        first, last = edges[np.append(True, apart)[: len(edges)], 0], edges[np.append(apart, True)[: len(edges)], 1]
+        long = (until[last] - until[first] >= shortest * (1.0 - TOLERANCE)) & (last - first > 1)
+        if not long.any():
+            raise ValueError(
+                f"expected the condition to hold for two samples of {self.name!r} and {shortest:g} s at least, got "
+                f"{holds.sum()} of {len(self)} samples where it does, in {len(first)} stretches: choose another one"
+            )
+        return [
+            replace(self._cut(a, b), name=f"{self.name}, {until[a]:.4g} to {until[b]:.4g} s")
+            for a, b in zip(first[long].tolist(), last[long].tolist(), strict=True)
+        ]
 
     def resample(self, sample_period: float, *, inputs_known_in_gaps: bool = False) -> "Record":
         """Put the record on a uniform grid from its first time stamp on.

@@ -1,6 +1,7 @@
 """Records: what they refuse and with which sentence, and slice, split and resample."""
 
 import copy
+import itertools
 import pickle
 from dataclasses import FrozenInstanceError, replace
 
@@ -282,6 +283,40 @@ def test_a_slice_in_which_an_output_rests_says_so():
     record = a_record(outputs={"position": floats(1, 1, 1, 2, 3)})
     with pytest.raises(ValueError, match="'position' never changes, it is 1 from sample 0 to 2.* longer part"):
         record.slice(0.0, 0.3)
+
+
+@PROPERTY
+@given(st.lists(st.booleans(), min_size=4, max_size=60), st.integers(0, 5), st.integers(0, 5))
+def test_stretches_are_the_runs_of_their_condition(holds, bridged, shortest):
+    """Against runs that are counted one by one."""
+    period, wanted = 0.25, list(holds)
+    runs = [(value, len(list(same))) for value, same in itertools.groupby(holds)]
+    place = 0
+    for i, (value, length) in enumerate(runs):
+        if not value and 0 < i < len(runs) - 1 and length <= bridged:
+            wanted[place : place + length] = [True] * length
+        place += length
+    expected, place = [], 0
+    for value, same in itertools.groupby(wanted):
+        length = len(list(same))
+        expected += [(place, place + length)] if value and length >= max(shortest, 2) else []
+        place += length
+    count = len(holds)
+    record = Record(5.0 + period * np.arange(count), {"command": noise(1, count)}, {"position": noise(2, count)})
+    times = {"bridged": bridged * period, "shortest": shortest * period}
+    if not expected:
+        with pytest.raises(ValueError, match=rf"expected the condition to hold .* got {sum(holds)} of {count} samples"):
+            record.stretches(holds, **times)
+        return
+    found = record.stretches(holds, **times)
+    assert [(round((r.time[0] - 5.0) / period), round((r.time[-1] - 5.0) / period) + 1) for r in found] == expected
+    assert len({r.name for r in found}) == len(found)
+
+
+@pytest.mark.parametrize("condition", [[True] * 4, [1.0] * 5, None, "command > 0", True])
+def test_a_condition_is_true_or_false_at_every_sample(condition):
+    with pytest.raises(ValueError, match="expected condition to be true or false at each of the 5 samples, got"):
+        a_record().stretches(condition)
 
 
 @pytest.mark.parametrize(

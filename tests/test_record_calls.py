@@ -83,6 +83,8 @@ CALLS = {
     "resample": (lambda odd: a_record().resample(odd), ()),
     "inputs_known_in_gaps": (lambda odd: a_record().resample(0.1, inputs_known_in_gaps=odd), ("true",)),
     "range": (lambda odd: a_record().within(position=odd), ()),
+    "condition": (lambda odd: a_record().stretches(odd), ()),
+    "shortest": (lambda odd: a_record().stretches([True] * 5, shortest=odd), ("zero", "tiny")),
     "end of a range": (lambda odd: a_record().within(position=(-2.0, odd)), ("inf",)),
     "model of a check": (lambda odd: a_record().check(odd), ("nothing",)),
     "select": (lambda odd: a_record().select(outputs=odd), ("empty",)),
