@@ -114,10 +114,10 @@ def test_misfit_inside_the_span_is_not_taken_for_coloured_noise():
     misfit = np.sin(np.arange(1500) / 40.0)
     residual = series(misfit + rng.normal(0.0, 0.1, 1500))
     measured = np.ones(residual.shape, bool)
-    found = noise_outside(residual, measured, series(misfit)[None])
+    found = noise_outside(residual, measured, [series(misfit)[None]])
     assert not found.coloured
     assert found.of[0][0].variance == pytest.approx(0.01, rel=0.15)
-    assert noise_outside(residual, measured, series(np.ones(1500))[None]).coloured
+    assert noise_outside(residual, measured, [series(np.ones(1500))[None]]).coloured
 
 
 @pytest.mark.parametrize("pole", [0.5, 0.85, 0.93])
@@ -132,7 +132,7 @@ def test_slow_noise_is_known_although_most_of_it_lies_in_the_space_of_the_causes
         noise = (1.0 - pole**2) ** 0.5 * lfilter([1.0], [1.0, -pole], rng.standard_normal(count + 500))[500:]
         phases = 2.0 * np.pi * np.outer(np.arange(1, 41), np.arange(count)) / count
         slow = np.concatenate([np.cos(phases), np.sin(phases)])[:, None, :, None]
-        ((of_record,),) = noise_outside(noise[None, :, None], np.ones((1, count, 1), bool), slow).of
+        ((of_record,),) = noise_outside(noise[None, :, None], np.ones((1, count, 1), bool), [slow]).of
         found.append(of_record.variance)
     assert 0.75 < np.mean(found) < 1.1
 
@@ -145,7 +145,7 @@ def test_noise_is_never_more_than_the_whole_residual():
     for _ in range(5):
         walk = np.cumsum(rng.standard_normal(count))
         walk = (walk - walk.mean())[None, :, None]
-        ((noise,),) = noise_outside(walk, np.ones((1, count, 1), bool), slow).of
+        ((noise,),) = noise_outside(walk, np.ones((1, count, 1), bool), [slow]).of
         assert 0.0 < noise.variance <= 1.1 * float(np.mean(walk**2))
 
 

@@ -1,17 +1,19 @@
 """Missing terms, from numbers alone: what is the unknowns', steps that do not wander, the least of equal terms."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from ehsvjax.diagnosis.bench.refits import span
-from ehsvjax.diagnosis.hypotheses.curves import Curve
+from ehsvjax.diagnosis.hypotheses.curves import Curve, hats
 from ehsvjax.diagnosis.hypotheses.missing import _damped_steps, _free, _least, _outside
 
 TIME = np.linspace(0.0, 1.0, 800)
 ALONG = np.sin(9.0 * TIME)
 KNOTS = np.linspace(-1.0, 1.0, 9)
 HATS = np.stack([np.interp(ALONG, KNOTS, value) for value in np.eye(len(KNOTS))])
-CURVE = Curve("force", "position", KNOTS, np.eye(len(KNOTS)), HATS, False, np.zeros(0))
+CURVE = Curve("force", "position", KNOTS, np.eye(len(KNOTS)), ALONG[None], partial(hats, KNOTS), False, np.zeros(0))
 # Unknowns that can do a constant, and something that no curve along the quantity does.
 UNKNOWNS = np.stack([np.full(len(TIME), 3.0), np.cos(70.0 * TIME)])
 

@@ -40,10 +40,14 @@ def smallest_p_values(
         seed: of the draws.
 
     """
+    from scipy.linalg import qr
+
     smallest = np.ones(_DRAWS)
     if not len(bases):
         return smallest
-    spread = np.linalg.qr(np.concatenate(bases, axis=1), mode="r")
+    # In place: of a long record every copy of them is large.
+    every = np.concatenate([basis.T for basis in bases]).T
+    _, spread = qr(every, mode="raw", overwrite_a=True, check_finite=False)
     # Single precision is far more than draws are worth, and half the time.
     noise = np.random.default_rng(seed).standard_normal((_DRAWS, len(spread)), dtype=np.float32)
     components = noise @ np.asarray(spread, np.float32)

@@ -5,7 +5,7 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,8 +62,11 @@ class Noise(NamedTuple):
                 first = whitened[..., :order] @ _first_innovations(noise).T
                 whitened = lfilter(np.concatenate([[1.0], -noise.coefficients]), 1.0, whitened, axis=-1)
                 whitened[..., :order] = first
-            parts.append(whitened[..., known[k, :, i]] / np.sqrt(noise.innovation_variance))
-        return np.concatenate(parts, axis=-1)
+            # A copy, of which no other is needed: of all responses of a long record each is large.
+            picked = whitened[..., known[k, :, i]].astype(float, copy=False)
+            picked /= np.sqrt(noise.innovation_variance)
+            parts.append(picked)
+        return np.concatenate(parts, axis=-1) if len(parts) > 1 else parts[0]
 
     def gained(
         self, left: Float[np.ndarray, "record time signal"], more: Float[np.ndarray, "record time signal"]
@@ -232,14 +235,14 @@ def _channels(measured) -> tuple[int, int]:
 def noise_outside(
     residual: Float[np.ndarray, "record time signal"],
     measured: Bool[np.ndarray, "record time signal"],
-    responses: Float[np.ndarray, "response record time signal"],
+    responses: Sequence[Float[np.ndarray, "_ record time signal"]],
 ) -> Noise:
     """Return the noise that is left of a residual outside the space of some responses.
 
     Args:
         residual: in the outputs' units; anything where nothing is measured.
         measured: where there is a sample.
-        responses: of all that may have acted: the model's sensitivities, the candidates' responses.
+        responses: of all that may have acted, each of so many: the model's sensitivities, the candidates' responses.
 
     """
     # An output that a record does not hold has no noise there.
@@ -248,7 +251,7 @@ def noise_outside(
     for k, i in channels:
         deviation[k, i] = _deviation(residual[k, :, i][measured[k, :, i]])
     standardised = np.where(measured, residual, 0.0) / deviation[:, None]
-    basis = _basis(np.where(measured, responses, 0.0) / deviation[:, None])
+    basis = _basis(np.concatenate(responses), measured, deviation)
     left = standardised - _combined(basis, np.tensordot(standardised.swapaxes(1, 2), basis, 3))
     # Directions that were taken of each output, a share of one where it is in several.
     taken = {(k, i): float(np.vdot(basis[k, i], basis[k, i])) for k, i in channels}
@@ -298,12 +301,15 @@ def _completed(
     """
     known, innovations = noise.known, noise.innovations(np.moveaxis(basis, (3, 1), (0, 3)))
     information, turned = np.linalg.eigh(innovations @ innovations.T)
+    along = innovations @ noise.innovations(left)
+    del innovations  # of a long record a large part of all memory
     told = information > _NEGLIGIBLE**2 * np.max(information, initial=0.0)
     root = turned[:, told] / np.sqrt(information[told])
-    whole = np.where(known, left - _combined(basis, root @ (root.T @ (innovations @ noise.innovations(left)))), 0.0)
+    whole = np.where(known, left - _combined(basis, root @ (root.T @ along)), 0.0)
 
     def completed(k, i):
-        here, unsure = known[k : k + 1, :, i], np.where(known[k, :, i, None], basis[k, i] @ root, 0.0)
+        here, unsure = known[k : k + 1, :, i], basis[k, i] @ root
+        unsure[~known[k, :, i]] = 0.0
         return residual_noise(whole[k : k + 1, :, i], here, "auto", autocovariance(unsure[None], here), taken[k, i])
 
     return {(k, i): completed(k, i) for k, i in taken}
@@ -319,18 +325,23 @@ def _alike(noise: ResidualNoise, before: ResidualNoise) -> bool:
     return all(abs(now - then) <= _SETTLED * abs(then) for now, then in pairs)
 
 
-def _basis(responses) -> Float[np.ndarray, "record signal time direction"]:
-    """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples."""
+def _basis(responses, measured, deviation) -> Float[np.ndarray, "record signal time direction"]:
+    """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples.
+
+    Of a long record the responses take much memory: they are standardised and made into unit vectors where they are.
+    """
     shape = responses.shape[1:]
+    responses[:, ~measured] = 0.0
+    responses /= deviation[:, None]
     flat = responses.reshape(len(responses), -1)
-    norms = np.linalg.norm(flat, axis=1)
-    flat = flat[norms > 0] / norms[norms > 0, None]
+    norms = np.sqrt(np.einsum("ij,ij->i", flat, flat))
+    flat /= np.where(norms > 0, norms, 1.0)[:, None]
     # There are many more samples than responses: their products are quicker decomposed.
     squares, combinations = np.linalg.eigh(flat @ flat.T)
     order = np.argsort(-squares)[: flat.shape[1] // 2]
     kept = order[squares[order] > _NEGLIGIBLE**2 * np.max(squares, initial=0.0)]
-    vectors = (combinations[:, kept] / np.sqrt(squares[kept])).T @ flat
-    return np.ascontiguousarray(vectors.reshape(-1, *shape).transpose(1, 3, 2, 0))
+    vectors = flat.T @ (combinations[:, kept] / np.sqrt(squares[kept]))
+    return np.ascontiguousarray(vectors.reshape(*shape, -1).swapaxes(1, 2))
 
 
 def _deviation(values) -> float:

@@ -46,15 +46,20 @@ def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: st
     counts = np.maximum(np.round(durations / length).astype(int), 1)
     within = np.where(bench.present, np.arange(bench.present.shape[1]) * counts[:, None] // lengths[:, None], -1)
     # What acts in one record does nothing in the others: a part of each is simulated at once.
-    added = np.zeros((1 + counts.max(), *within.shape, len(bench.places)))
-    for k in range(counts.max()):
-        added[k + 1, within == k, bench.places.index(place)] = counts.max() * bench.probes[place]
-    outputs = bench.sketched(np.repeat(point[None], len(added), axis=0), added)
-    changes = (outputs[1:] - outputs[0]) / (counts.max() * bench.probes[place])
+    size = float(counts.max() * bench.probes[place])
+
+    def over_part(k: int) -> Float[np.ndarray, "record time place"]:
+        added = np.zeros((*within.shape, len(bench.places)))
+        added[within == k, bench.places.index(place)] = size
+        return added
+
+    changes = bench.responses(point, int(counts.max()), over_part) / size
     of_record = np.repeat(np.arange(len(counts)), counts)
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    responses = np.zeros((len(of_record), *changes.shape[1:]))
-    for part, record in enumerate(of_record):
-        responses[part, record] = changes[part - first[record], record]
+    responses = changes
+    if len(counts) > 1:
+        responses = np.zeros((len(of_record), *changes.shape[1:]))
+        for part, record in enumerate(of_record):
+            responses[part, record] = changes[part - first[record], record]
     of_sample = np.where(bench.present, within + first[:, None], -1)
     return Parts(place, of_sample, of_record, length, responses)

@@ -18,6 +18,8 @@ _PATIENCE = 4
 _STEEPEST = 1e100
 # How many times as long the steps are at which a refit begins where that many times as many are not few.
 _COARSER = 8
+# Starts whose derivatives are taken at once.
+_LINEARISED_TOGETHER = 8
 # Share of a step at which its curvature is taken, and of the step that its acceleration may be.
 _AHEAD, _MOST_BENT = 0.1, 0.75
 
@@ -74,7 +76,7 @@ def unexplained(
 
 def noise_of_all_left(bench: Workbench, final: Refits) -> Noise:
     """Return the noise of a refit's residual, if all that is left of it is noise."""
-    return noise_outside(final.residual[0], bench.problem.samples.measured, final.slopes[0])
+    return noise_outside(final.residual[0], bench.problem.samples.measured, [final.slopes[0]])
 
 
 def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
@@ -112,6 +114,8 @@ def refit(
     count, width = chosen.shape
     points = starts.copy()
     kept: list[_Here | None] = [None] * count
+    # Of all starts at once: of a long record by far the most that there is to remember.
+    every_slope = np.zeros((count, width, *readings.shape))
     damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
     cost = np.full(count, np.inf)
     converged, hopeless = np.zeros(count, bool), np.zeros(count, int)
@@ -124,17 +128,15 @@ def refit(
         at = np.flatnonzero(running)
         if not len(at):
             break
-        y, slopes = bench.linearised(trial[at], chosen[at])
-        residual = readings[None] - y
-        scaled = noise.scaled(residual)
-        columns = noise.scaled(slopes)
-        for row, i in enumerate(at):
-            value = float(scaled[row] @ scaled[row])
-            jacobian = columns[:, row]
+        for i, y, slopes in _linearised(bench, at, trial, chosen):
+            residual = readings - y
+            scaled, jacobian = noise.scaled(residual), noise.scaled(slopes)
+            value = float(scaled @ scaled)
             # A NaN is no improvement, nor is a place that is so steep that nothing can be told from there.
             if value < cost[i] and np.max(np.abs(jacobian), initial=0.0) < _STEEPEST:
                 points[i], cost[i] = trial[i], value
-                kept[i] = _Here(residual[row], slopes[:, row], jacobian, jacobian @ scaled[row], jacobian @ jacobian.T)
+                every_slope[i, chosen[i] >= 0] = slopes[chosen[i] >= 0]
+                kept[i] = _Here(residual, every_slope[i], jacobian @ scaled, jacobian @ jacobian.T)
                 damping[i], growth[i] = 0.1 * damping[i], 2.0
             else:
                 damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
@@ -143,7 +145,7 @@ def refit(
                 running[i] = False
                 continue
             step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
-            variance = max(cost[i] / scaled.shape[1], 1e-300)
+            variance = max(cost[i] / len(scaled), 1e-300)
             bending[i] = gain > variance
             if gain < 0.01 * variance:
                 converged[i] = True
@@ -154,16 +156,18 @@ def refit(
             trial[i] = points[i] + step
         # Near the minimum no valley is left to follow.
         _bend(bench, noise, trial, np.flatnonzero(running & bending), points, chosen, kept, damping, lower, upper)
-    shape = bench.problem.samples.outputs.shape
-    nothing = (np.full(shape, np.nan), np.zeros((width, *shape)))
-    return Refits(
-        points,
-        cost,
-        np.stack([k.residual if k else nothing[0] for k in kept]),
-        np.stack([k.slopes if k else nothing[1] for k in kept]),
-        chosen,
-        converged,
-    )
+    nothing = np.full(readings.shape, np.nan)
+    residuals = np.stack([k.residual if k else nothing for k in kept])
+    return Refits(points, cost, residuals, every_slope, chosen, converged)
+
+
+def _linearised(bench: Workbench, at, trial, chosen):
+    """Yield some starts, and the outputs and their derivatives at the trial of each, some at a time."""
+    for first in range(0, len(at), _LINEARISED_TOGETHER):
+        some = at[first : first + _LINEARISED_TOGETHER]
+        outputs, slopes = bench.linearised(trial[some], chosen[some])
+        for row, i in enumerate(some):
+            yield i, outputs[row], slopes[:, row]
 
 
 def _led_roughly(bench: Workbench, starts, chosen, noise: Noise, race) -> Float[np.ndarray, "individual parameter"]:
@@ -180,11 +184,10 @@ def _led_roughly(bench: Workbench, starts, chosen, noise: Noise, race) -> Float[
 
 
 class _Here(NamedTuple):
-    """What is known at the best point of a start; from the jacobian on scaled."""
+    """What is known at the best point of a start; from the gradient on scaled."""
 
     residual: Float[np.ndarray, "record time signal"]
     slopes: Float[np.ndarray, "direction record time signal"]
-    jacobian: Float[np.ndarray, "direction sample"]
     gradient: Float[np.ndarray, " direction"]
     information: Float[np.ndarray, "direction direction"]
 
@@ -200,10 +203,11 @@ def _bend(bench, noise, trial, running, points, chosen, kept, damping, lower, up
         assert here is not None
         along = np.where(chosen[i] >= 0, steps[row][own], 0.0)
         changed = noise.scaled(ahead[row] - (bench.problem.samples.outputs - here.residual))
-        curvature = 2.0 / _AHEAD * (changed / _AHEAD - along @ here.jacobian)
+        jacobian = noise.scaled(here.slopes)
+        curvature = 2.0 / _AHEAD * (changed / _AHEAD - along @ jacobian)
         if not np.isfinite(curvature).all():
             continue
-        gradient = -(here.jacobian @ curvature)
+        gradient = -(jacobian @ curvature)
         bent, _ = _step(points[i], chosen[i], gradient, here.information, damping[i], lower, upper)
         size = np.sqrt(np.diag(here.information))
         if 2.0 * np.linalg.norm(size * bent[own]) <= _MOST_BENT * np.linalg.norm(size * along):

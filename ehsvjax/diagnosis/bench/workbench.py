@@ -7,7 +7,7 @@ of the initial conditions. What is tried differs in its data only, so that nothi
 import functools
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -28,6 +28,8 @@ from ehsvjax.record import Record
 
 # Simulated side by side: so few that a handful of points keeps all cores busy.
 _ABREAST = 8
+# Disturbances that are made at once.
+_TOGETHER = 32
 ROUNDING = 3e-14
 """Of the outputs: a smaller change is none."""
 TOLD_APART = 3e-5
@@ -171,7 +173,9 @@ class Workbench:
         here = self.problem.substeps if substeps is None else substeps
         problem = replace(self._on_device, substeps=np.int32(here))
 
-        def outputs(first: int) -> Float[np.ndarray, "individual record time signal"]:
+        every = np.empty((len(points), *problem.samples.outputs.shape))
+
+        def simulate(first: int) -> None:
             some = points[first : first + _ABREAST]
             added: Any = self._always_added
             if disturbances is not None:
@@ -181,9 +185,11 @@ class Workbench:
             with jax.enable_x64(True):
                 filled = jnp.asarray(_filled(some, _ABREAST))
                 acting = replace(problem, known=problem.known | self._acting(some))
-                return np.asarray(_simulated(acting, filled, jnp.asarray(added)))[: len(some)]
+                outputs = _simulated(acting, filled, jnp.asarray(added))
+                every[first : first + _ABREAST] = np.asarray(outputs)[: len(some)]
 
-        every = np.concatenate(list(_threads().map(outputs, range(0, len(points), _ABREAST))))
+        # Taking the results raises what a simulation has raised.
+        list(_threads().map(simulate, range(0, len(points), _ABREAST)))
         # What comes after the end of a record is nothing, whatever the model would do there.
         every[:, ~self.present] = 0.0
         return every
@@ -227,6 +233,25 @@ class Workbench:
     ) -> Float[np.ndarray, "individual record time signal"]:
         """Return the outputs as `simulated` does, for what is compared with one another only, not with readings."""
         return self.simulated(points, disturbances, self.sketched_at)
+
+    def responses(
+        self,
+        point: Float[np.ndarray, " parameter"],
+        count: int,
+        disturbance: Callable[[int], Float[np.ndarray, "record time place"]],
+    ) -> Float[np.ndarray, "disturbance record time signal"]:
+        """Return what each of so many disturbances changes in the outputs of a point, sketched.
+
+        They are made as they are simulated: of a long record all at once would take more memory than what they do.
+        """
+        here = self.sketched(point[None])[0]
+        # Single precision is far more than sketches are worth.
+        changes = np.empty((count, *here.shape), np.float32)
+        for first in range(0, count, _TOGETHER):
+            rows = range(first, min(first + _TOGETHER, count))
+            added = np.stack([disturbance(row) for row in rows])
+            changes[first : rows.stop] = self.sketched(np.repeat(point[None], len(rows), axis=0), added) - here
+        return changes
 
     def linearised(
         self, points: Float[np.ndarray, "individual parameter"], chosen: Int[np.ndarray, "individual direction"]

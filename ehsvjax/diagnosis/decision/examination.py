@@ -60,7 +60,7 @@ def examine(selection: Selection) -> Examination:
     before = dependences(selection.nominal, noise, terms)
     after = before
     if selection.included:
-        terms = terms_at(bench, selection.final.points[0], selection.seen)
+        terms = terms_at(bench, selection.final.points[0], terms.curves)
         after = dependences(selection.final, noise, terms)
     # Noise that is seen outside all responses excuses what lies along them. An autoregression of all that is left takes
     # any slow misfit for its own: it does so only if the experiment was repeated and left something else.

@@ -260,7 +260,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
         tried = responses_at(
             bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.parts
         )
-        spanned = np.concatenate([current.slopes[0], tried.changes, trials.terms.responses])
+        spanned = current.slopes[0], tried.changes, trials.terms.responses
         noise = noise_outside(current.residual[0], measured, spanned)
         before = trials
         trials, current = _known(before, included, current, noise)

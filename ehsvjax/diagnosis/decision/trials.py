@@ -12,7 +12,7 @@ from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit, span
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
-from ehsvjax.diagnosis.hypotheses.curves import Terms, quantities, terms_at
+from ehsvjax.diagnosis.hypotheses.curves import Terms, every_curve, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import parts_of
 from ehsvjax.diagnosis.hypotheses.screening import Screened
 from ehsvjax.effects.effect import UNLIMITED
@@ -52,7 +52,7 @@ class Trials(NamedTuple):
 def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and parts of harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    return Trials(bench, seen, terms_at(bench, bench.nominal, seen), parts_of(bench), {}, progress)
+    return Trials(bench, seen, terms_at(bench, bench.nominal, every_curve(bench, seen)), parts_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:

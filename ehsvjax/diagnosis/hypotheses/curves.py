@@ -5,9 +5,9 @@ time, ...). It is a sum of pieces, straight ones or waves; their coefficients co
 that place.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -37,7 +37,8 @@ class Curve(NamedTuple):
         quantity: that it depends on.
         knots: `[knot]` ascending values of the quantity.
         values: `[piece, knot]` each piece there.
-        pieces: `[piece, record, time]` each piece along the records.
+        series: `[record, time]` the quantity along the records.
+        form: the pieces at any values of the quantity.
         relative: whether it is a share of the value at the place.
         periods: `[wave]` of the waves of which each could be the whole term, in the quantity's unit; none of straight
             pieces.
@@ -48,9 +49,15 @@ class Curve(NamedTuple):
     quantity: str
     knots: Float[np.ndarray, " knot"]
     values: Float[np.ndarray, "piece knot"]
-    pieces: Float[np.ndarray, "piece record time"]
+    series: Float[np.ndarray, "record time"]
+    form: Callable[[Float[np.ndarray, "..."]], Float[np.ndarray, "piece ..."]]
     relative: bool
     periods: Float[np.ndarray, " wave"]
+
+    @property
+    def pieces(self) -> Float[np.ndarray, "piece record time"]:
+        """Each piece along the records, made anew: those of all curves of a long record would take much memory."""
+        return self.form(self.series)
 
 
 class Terms(NamedTuple):
@@ -86,15 +93,13 @@ def quantities(bench: Workbench) -> dict[str, Float[np.ndarray, "record time"]]:
     return kept
 
 
-def terms_at(
-    bench: Workbench, point: Float[np.ndarray, " parameter"], seen: Mapping[str, Float[np.ndarray, "record time"]]
-) -> Terms:
-    """Return the terms of all tests, along all quantities at all places, at a point."""
-    curves = _curves(bench, seen)
+def terms_at(bench: Workbench, point: Float[np.ndarray, " parameter"], curves: list[Curve]) -> Terms:
+    """Return the terms of curves at a point."""
     return Terms(curves, curve_responses(bench, point, curves))
 
 
-def _curves(bench: Workbench, seen: Mapping[str, Float[np.ndarray, "record time"]]) -> list[Curve]:
+def every_curve(bench: Workbench, seen: Mapping[str, Float[np.ndarray, "record time"]]) -> list[Curve]:
+    """Return the curves of all tests, along all quantities at all places."""
     places = (*bench.places, *bench.problem.observed)
     coarse = [straight_along(bench, place, quantity, seen, _COARSE) for place in places for quantity in seen]
     waves = min(_WAVES, int(bench.present.sum()) // _SAMPLES_PER_WAVE)
@@ -109,36 +114,42 @@ def straight_along(
 ) -> Curve:
     """Return the curve of so many straight pieces along a quantity at a place."""
     knots = knots_along(seen[quantity][bench.present], pieces)
-    values = np.eye(len(knots))
-    hats = np.stack([np.interp(seen[quantity], knots, value) for value in values])
-    return Curve(place, quantity, knots, values, hats, _is_opening(bench, place), np.zeros(0))
+    return _curve(bench, place, quantity, knots, seen[quantity], partial(hats, knots), np.zeros(0))
 
 
 def wave_along(
     bench: Workbench, place: str, quantity: str, seen: Mapping[str, Float[np.ndarray, "record time"]], period: float
 ) -> Curve:
     """Return the curve that repeats with a period of a quantity, in two phases."""
-    series = seen[quantity]
-    there = series[bench.present]
-    number = np.ptp(there) / period
-    knots = np.linspace(there.min(), there.max(), int(number * _KNOTS_PER_WAVE) + 2)
-    return Curve(
-        place, quantity, knots, _phases(_share(knots, there), number), _phases(_share(series, there), number),
-        _is_opening(bench, place), np.array([period]),
-    )  # fmt: skip
+    there = seen[quantity][bench.present]
+    least, size = there.min(), np.ptp(there)
+    knots = np.linspace(least, there.max(), int(size / period * _KNOTS_PER_WAVE) + 2)
+
+    def form(along):
+        return _phases((along - least) / size, size / period)
+
+    return _curve(bench, place, quantity, knots, seen[quantity], form, np.array([period]))
 
 
 def _waves_along(bench, place, quantity, series, waves) -> Curve:
     """Return the curve of all waves of which there are at most so many in the range, in steps of half a wave."""
     there = series[bench.present]
-    knots = np.linspace(there.min(), there.max(), waves * _KNOTS_PER_WAVE)
-    values, pieces = (_all_waves(_share(along, there), waves) for along in (knots, series))
-    periods = np.ptp(there) / _wave_numbers(waves)
-    return Curve(place, quantity, knots, values, pieces, _is_opening(bench, place), periods)
+    least, size = there.min(), np.ptp(there)
+    knots = np.linspace(least, there.max(), waves * _KNOTS_PER_WAVE)
+
+    def form(along):
+        return _all_waves((along - least) / size, waves)
+
+    return _curve(bench, place, quantity, knots, series, form, size / _wave_numbers(waves))
 
 
-def _share(along, series):
-    return (along - series.min()) / np.ptp(series)
+def _curve(bench: Workbench, place, quantity, knots, series, form, periods) -> Curve:
+    return Curve(place, quantity, knots, form(knots), series, form, _is_opening(bench, place), periods)
+
+
+def hats(knots: Float[np.ndarray, " knot"], along: Float[np.ndarray, "..."]) -> Float[np.ndarray, "knot ..."]:
+    """Return straight pieces at some values: each is one at its own knot and nothing at the others."""
+    return np.stack([np.interp(along, knots, value) for value in np.eye(len(knots))])
 
 
 def _phases(share, number) -> Float[np.ndarray, "phase ..."]:
@@ -152,7 +163,7 @@ def _all_waves(share, waves) -> Float[np.ndarray, "piece ..."]:
 
 def waves_in(curve: Curve) -> int:
     """Return how many waves there are in the range at most, of a curve of all waves."""
-    return (len(curve.pieces) - 1) // 4
+    return (len(curve.values) - 1) // 4
 
 
 def _wave_numbers(waves) -> Float[np.ndarray, " wave"]:
@@ -197,26 +208,25 @@ def probe_at(bench: Workbench, place: str) -> float:
 
 def curve_responses(bench: Workbench, point, curves: Sequence[Curve]) -> Float[np.ndarray, "piece record time signal"]:
     """Return what each piece of curves, as large as a probe, does to the outputs."""
-    samples = bench.problem.samples
-    inside = [c for c in curves if c.place in bench.places]
-    added = np.zeros((1 + sum(len(c.pieces) for c in inside), *samples.outputs.shape[:2], len(bench.places)))
-    row = 1
-    for curve in inside:
-        acting = _acting(bench, curve, curve.pieces)
-        added[row : row + len(curve.pieces), ..., bench.places.index(curve.place)] = acting
-        row += len(curve.pieces)
-    outputs = bench.sketched(np.repeat(point[None], len(added), axis=0), added) if inside else None
-    changes, row = [], 1
-    for curve in curves:
-        if curve.place in bench.places:
-            assert outputs is not None
-            changes.append(outputs[row : row + len(curve.pieces)] - outputs[0])
-            row += len(curve.pieces)
-        else:
-            sensed = np.zeros((len(curve.pieces), *samples.outputs.shape))
-            sensed[..., bench.problem.observed.index(curve.place)] = _acting(bench, curve, curve.pieces)
-            changes.append(sensed)
-    return np.concatenate(changes)
+    rows = [(of, piece) for of, curve in enumerate(curves) for piece in range(len(curve.values))]
+    inside = [row for row, (of, _) in enumerate(rows) if curves[of].place in bench.places]
+
+    @lru_cache(maxsize=1)
+    def acting(of: int) -> Float[np.ndarray, "piece record time"]:
+        return _acting(bench, curves[of], curves[of].pieces)
+
+    def at_its_place(k: int) -> Float[np.ndarray, "record time place"]:
+        of, piece = rows[inside[k]]
+        added = np.zeros((*bench.present.shape, len(bench.places)))
+        added[..., bench.places.index(curves[of].place)] = acting(of)[piece]
+        return added
+
+    changes = np.zeros((len(rows), *bench.problem.samples.outputs.shape), np.float32)
+    changes[inside] = bench.responses(point, len(inside), at_its_place)
+    for row, (of, piece) in enumerate(rows):
+        if curves[of].place in bench.problem.observed:
+            changes[row, ..., bench.problem.observed.index(curves[of].place)] = acting(of)[piece]
+    return changes
 
 
 def outputs_with(bench: Workbench, points, coefficients, curve: Curve):

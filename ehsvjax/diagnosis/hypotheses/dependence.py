@@ -53,7 +53,7 @@ def dependences(final: Refits, noise: Noise, terms: Terms) -> tuple[Dependence, 
     found = [
         Dependence(
             test.curve.place, test.curve.quantity, p, corrected(p, null, len(tests)), _explained(c),
-            len(test.curve.pieces), _period(test, c),
+            len(test.curve.values), _period(test, c),
         )
         for test, p, c in zip(tests, p_values, components, strict=True)
     ]  # fmt: skip
@@ -117,10 +117,10 @@ def _log_of_chi_square(value: float, freedom: int) -> float:
 def _examined(final: Refits, noise: Noise, terms: Terms) -> tuple[list[_Test], Float[np.ndarray, "..."]]:
     """Return the tests of curves that could show at all, and the whitened residual."""
     known, r = unexplained(final, noise.innovations)
-    changes = noise.innovations(terms.responses)
-    rows = np.split(changes, np.cumsum([len(c.pieces) for c in terms.curves])[:-1])
+    rows = np.split(terms.responses, np.cumsum([len(c.values) for c in terms.curves])[:-1])
     tests = []
-    for curve, part in zip(terms.curves, rows, strict=True):
+    for curve, responses in zip(terms.curves, rows, strict=True):
+        part = noise.innovations(responses)
         outside = part - (part @ known) @ known.T
         basis = _basis(outside, np.linalg.norm(part, axis=1))
         if basis.shape[1]:

@@ -19,6 +19,8 @@ from ehsvjax.diagnosis.bench.refits import Refits, unexplained
 from ehsvjax.diagnosis.bench.workbench import Workbench, duration_of
 from ehsvjax.effects.effect import Candidate, Scales
 
+# Frequencies of which what they do is computed at once.
+_TOGETHER = 32
 # Frequencies of each effect that are tried.
 _TRIED = 3
 # Two frequencies differ if they drift apart by this many periods along the record; the search looks closer.
@@ -142,15 +144,16 @@ def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
         every = jax.vmap(
             every_time, in_axes=({n.name: 0 if n.name == "frequency" else None for n in numbers}, None, None)
         )
-        rows = [
-            every(
-                {**absent, n.name: n.tries(scales)[0], "frequency": jnp.asarray(frequencies)},
-                jnp.asarray(internal.values[candidate.signal]),
-                {name: jnp.asarray(series) for name, series in context.items()},
-            )
-            for n in amplitudes
-        ]
-        means = [parts.means(np.asarray(row)) for row in rows]
+        value = jnp.asarray(internal.values[candidate.signal])
+        along = {name: jnp.asarray(series) for name, series in context.items()}
+
+        def means_of(amplitude, some):
+            own = {**absent, amplitude.name: amplitude.tries(scales)[0], "frequency": jnp.asarray(some)}
+            return parts.means(np.asarray(every(own, value, along)))
+
+        # Some at a time: of a long record all of them take more memory than all else.
+        blocks = np.split(frequencies, range(_TOGETHER, len(frequencies), _TOGETHER))
+        means = [np.concatenate([means_of(n, some) for some in blocks]) for n in amplitudes]
     # Each record has amplitudes of its own.
     own = parts.of_record == np.arange(len(bench.records))[:, None]
     return np.stack([mean * inside for mean in means for inside in own], axis=1)

@@ -107,7 +107,7 @@ def missing_term(
             curve = wave_along(bench, suspect.place, suspect.quantity, seen, suspect.period)
         else:
             curve = straight_along(bench, suspect.place, suspect.quantity, seen, suspect.pieces)
-        return _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.pieces)))
+        return _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.values)))
 
     def drawn_finely(coarse):
         start = coarse.settled
@@ -156,7 +156,7 @@ def missing_term(
 
 def told_by(bench: Workbench, final: Refits, noise: Noise, curve: Curve) -> Workbench:
     """Return the bench with a curve that acts as the readings of this noise tell it, and no others."""
-    drawn = _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.pieces)))
+    drawn = _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.values)))
     return bench_with(bench, curve, drawn.smooth.coefficients)
 
 
@@ -312,7 +312,7 @@ def _outside(pieces, known) -> Float[np.ndarray, "piece sample"]:
 def _free(curve: Curve, pieces, known) -> Float[np.ndarray, "line piece"]:
     """Return the straight lines along a curve that the unknowns make up for; no single wave has any."""
     if len(curve.periods):
-        return np.zeros((0, len(curve.pieces)))
+        return np.zeros((0, len(curve.values)))
     straight = np.stack([np.ones(len(curve.knots)), (curve.knots - curve.knots.mean()) / np.ptp(curve.knots)])
     combinations, sines = _angles(straight @ pieces, known)
     return combinations[sines <= _OWN] @ straight
