@@ -170,7 +170,7 @@ def test_blocks_do_not_show(count):
 
 
 def test_elsewhere_than_on_the_cpu_everything_is_the_function_itself(monkeypatch):
-    monkeypatch.setattr(kernels, "_on_cpu", lambda: False)
+    monkeypatch.setattr(kernels, "_shaped", lambda: False)
     x, y = jnp.float32(0.3), jnp.float32(-0.4)
     for wrapper in WRAPPERS.values():
         assert "xla_metadata" not in str(jax.make_jaxpr(wrapper(_shared))(x, y))
@@ -179,9 +179,9 @@ def test_elsewhere_than_on_the_cpu_everything_is_the_function_itself(monkeypatch
 
 
 def test_device_that_the_user_chose_is_heeded():
-    assert kernels._on_cpu()
+    assert kernels._shaped()
     with jax.default_device(jax.devices("cpu")[0]):
-        assert kernels._on_cpu()
+        assert kernels._shaped()
 
 
 _IN_ANOTHER_PROCESS = """

@@ -51,7 +51,7 @@ def test_the_lines_that_the_unknowns_make_up_for_are_free():
     assert len(free) == 1 and np.ptp(free[0]) < 1e-9
     both = _free(CURVE, HATS, span(np.vstack([UNKNOWNS, ALONG])))
     assert len(both) == 2 and np.linalg.matrix_rank(np.vstack([both, np.ones(9), KNOTS]), tol=1e-6) == 2
-    wave = CURVE._replace(values=np.ones((2, 9)), pieces=HATS[:2], periods=np.array([0.3]))
+    wave = CURVE._replace(values=np.ones((2, 9)), periods=np.array([0.3]))
     assert _free(wave, HATS[:2], span(UNKNOWNS)).shape == (0, 2)
 
 
