@@ -39,24 +39,21 @@ def play(value, memory, half_width):
 
 
 def _gauss(count):
-    """Return points of a period with their weights, by which integrals over it are exact to power 2 count - 1."""
-    return [(0.5 + 0.5 * x, 0.5 * w) for x, w in zip(*np.polynomial.legendre.leggauss(count), strict=True)]
+    """Return points of a period and their weights, by which integrals over it are exact to power 2 count - 1."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    return 0.5 + 0.5 * points, 0.5 * weights
 
 
 def _legendre(fraction):
-    """Return the first three Legendre polynomials of a fraction of a period."""
+    """Return the first three Legendre polynomials of a fraction of a period, `[..., order]`."""
     middle = 2.0 * fraction - 1.0
-    return 1.0, middle, 1.5 * middle**2 - 0.5
+    return jnp.stack([jnp.ones_like(middle), middle, 1.5 * middle**2 - 0.5], axis=-1)
 
 
-def _parabola(moments):
-    """Return the parabola `[time, node]` of every period that has three moments `[time]`, those by `_legendre`.
-
-    To a plant that does not turn far within a period, what is no parabola acts like this one: by the mean alone a
-    delay that is short beside the period is wrong by half of what it does.
-    """
-    mean, first, second = moments[0], 3.0 * moments[1], 5.0 * moments[2]
-    return jnp.stack([mean - first + second, mean - 0.5 * second, mean + first + second], axis=-1)
+# Of a parabola with given moments by these polynomials, at its three nodes, `[order, node]`. To a plant that does not
+# turn far within a period, what is no parabola acts like the one of the same moments: by the mean alone a delay that is
+# short beside the period is wrong by half of what it does.
+_AT_NODES = np.array([[1.0, 1.0, 1.0], [-3.0, 0.0, 3.0], [5.0, -2.5, 5.0]])
 
 
 def _delayed(own, course, context):
@@ -67,20 +64,18 @@ def _delayed(own, course, context):
     # Every period holds the end of one that came before and the beginning of the next.
     at = jnp.arange(-1, len(course)) - whole.astype(int)
     earlier = jnp.where(at[:, None] >= 0, course[jnp.clip(at, 0, len(course) - 1)], 0.0)
+    points, weights = (jnp.asarray(each, course.dtype) for each in _gauss(3))
 
-    def moments(nodes, begins, length, arrives):
+    def moved(nodes, begins, length, arrives):
         """Of a piece of a period, which begins at one fraction of that and arrives at one of the delayed."""
-        start, middle, end = nodes.T
-        found = [0.0, 0.0, 0.0]
-        for point, weight in _gauss(3):
-            f = begins + length * point
-            value = (2.0 * f - 1.0) * ((f - 1.0) * start + f * end) + 4.0 * f * (1.0 - f) * middle
-            orders = _legendre(arrives + length * point)
-            found = [so_far + length * weight * order * value for so_far, order in zip(found, orders, strict=True)]
-        return found
+        f = begins + length * points
+        by_node = jnp.stack([(2.0 * f - 1.0) * (f - 1.0), 4.0 * f * (1.0 - f), f * (2.0 * f - 1.0)])
+        to_node = (
+            ((length * weights)[None] * by_node) @ _legendre(arrives + length * points) @ _AT_NODES.astype(course.dtype)
+        )
+        return sum(nodes[:, j, None] * to_node[j, None] for j in range(3))
 
-    pieces = moments(earlier[:-1], 1.0 - part, part, 0.0), moments(earlier[1:], 0.0, 1.0 - part, part)
-    return _parabola([before + after for before, after in zip(*pieces, strict=True)])
+    return moved(earlier[:-1], 1.0 - part, part, 0.0) + moved(earlier[1:], 0.0, 1.0 - part, part)
 
 
 def _between_steps(own, course, context):
@@ -97,11 +92,10 @@ def _lagged(own, course, context):
     # Moments of exp(-ratio * fraction) by parts; where differences would be lost in rounding, by quadrature.
     mean = -jnp.expm1(-ratio) / ratio
     first = (2.0 * mean - 1.0 - decay) / ratio
-    second = mean + 6.0 * first / ratio
-    slow = jnp.minimum(ratio, 1.0)
-    at_points = [[weight * jnp.exp(-slow * point) * order for order in _legendre(point)] for point, weight in _gauss(5)]
-    _, *by_points = map(sum, zip(*at_points, strict=True))
-    first, second = (jnp.where(ratio < 1.0, *both) for both in zip(by_points, (first, second), strict=True))
+    by_parts = jnp.stack([mean, first, mean + 6.0 * first / ratio])
+    points, weights = (jnp.asarray(each, course.dtype) for each in _gauss(5))
+    by_points = (weights * jnp.exp(-jnp.minimum(ratio, 1.0) * points)) @ _legendre(points)
+    moments = jnp.where(ratio < 1.0, by_points, by_parts) @ _AT_NODES.astype(course.dtype)
 
     # What follows a straight line is that line, later by the time constant, but for what decays.
     start, middle, end = course.T
@@ -113,7 +107,8 @@ def _lagged(own, course, context):
         return line + slope + (level - line) * decay, level - line
 
     off = lax.scan(follow, jnp.zeros((), course.dtype), (line, slope))[1]
-    lagging = _parabola([line + 0.5 * slope + off * mean, slope / 6.0 + off * first, off * second])
+    straight = jnp.stack([line, line + 0.5 * slope, line + slope], axis=-1)
+    lagging = straight + off[:, None] * moments[None]
     return jnp.where(own["time_constant"] > 0.0, lagging, course)
 
 
