@@ -75,7 +75,7 @@ def _left(diagnosis: "Diagnosis") -> str:
     left = diagnosis.left
     if left.innocent:
         return ""
-    seen = f"it depends on {left.quantity} (seen from {left.place})"
+    seen = f"it depends on {left.quantity}, as if a term were missing at {left.place}"
     return f" Something is left that no candidate explains: {seen}.{_or_chance(diagnosis)}"
 
 
@@ -144,7 +144,7 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
         first = diagnosis.misfit.tests[0]
         repeating = _repeating(first.period, quantity_unit(diagnosis.fit.model, first.quantity))
         lines.append(
-            f"the residual depends on {first.quantity}{repeating} (seen from {first.place}): p "
+            f"the residual depends on {first.quantity}{repeating}, as if a term were missing at {first.place}: p "
             f"{_p(first.corrected)} for all {len(diagnosis.misfit.tests)} tests together"
         )
     return lines
