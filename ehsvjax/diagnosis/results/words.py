@@ -277,9 +277,10 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
         )
         if np.isfinite(g.share_removed):
             low, high = g.share_interval
+            share = round(100 * g.share_removed, 1)
             line += (
-                f"; {100 * g.share_removed:.1f}% of the removable error removed "
-                f"(95%: {100 * low:.1f} to {100 * high:.1f}{_MORE_THAN_ALL if g.share_removed > 1.0 else ''})"
+                f"; {share}% of the removable error removed "
+                f"(95%: {100 * low:.1f} to {100 * high:.1f}{_MORE_THAN_ALL if share > 100.0 else ''})"
             )
         lines.append(line)
     return lines
