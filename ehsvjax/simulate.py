@@ -207,7 +207,8 @@ def scan_model(
         the last carry, and what was kept, stacked `[time, ...]`.
 
     """
-    periods = course(inputs, holds, grid.hold), _prepared(equations, grid, parameters, inputs, holds, sample_period)
+    given = course(inputs, holds, grid.hold)
+    periods = given, _prepared(equations, grid, parameters, given, holds, sample_period)
 
     def inputs_at(here, fraction):
         given, changed = here
@@ -231,11 +232,11 @@ def scan_model(
     return scan_samples(step, state, visit_state, carry, (periods, samples), inputs_of, scan)
 
 
-def _prepared(equations, grid, parameters, inputs, holds, sample_period) -> dict[str, tuple[Array, ...]]:
+def _prepared(equations, grid, parameters, given, holds, sample_period) -> dict[str, tuple[Array, ...]]:
     """Return the course of every input that the equations change as a whole, by name."""
     if equations.prepare is None:
         return {}
-    nodes = at_nodes(course(inputs, holds, grid.hold))
+    nodes = at_nodes(given)
     column = {name: i for i, name in enumerate(equations.inputs)}
     changed = equations.prepare(parameters, {name: nodes[..., i] for name, i in column.items()}, sample_period)
     return {

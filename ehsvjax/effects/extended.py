@@ -235,18 +235,18 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
     def prepare(parameters, series, sample_period):
         parameters = corrected(parameters)
         changed = {} if base.prepare is None else base.prepare(parameters, series, sample_period)
+        some = next(iter(series.values()))
+        samples = jnp.arange(len(some), dtype=some.dtype)
+        time = sample_period * jnp.stack([samples, samples + 0.5, samples + 1.0], axis=-1)
+        context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
         for name, effects in inputs.items():
-            course = changed.get(name, series[name])
-            samples = jnp.arange(len(course), dtype=course.dtype)
-            time = sample_period * jnp.stack([samples, samples + 0.5, samples + 1.0], axis=-1)
-            context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
 
-            def behind_effects(course, effects=effects, context=context):
+            def behind_effects(course, effects=effects):
                 for c in effects:
                     course = c.effect.apply(own_of(c, parameters), course, context)
                 return (course,)
 
-            (course,) = where_on(parameters, [name], behind_effects, course)
+            (course,) = where_on(parameters, [name], behind_effects, changed.get(name, series[name]))
             changed = changed | {name: course}
         return changed
 

@@ -95,8 +95,7 @@ def draws(fit: Fit, of: Prepared, key: Key[Array, ""], count: int, kind: str) ->
     found, noises = of.first_order.found, of.first_order.noises
     assert noises is not None
     variance = _sample_variance(fit, of)
-    free = slice(len(of.problem.free))
-    told = np.where(of.first_order.seen, found.scale, np.nan)[free]
+    linear = precision(fit, of)
     return bootstrap(
         of.problem,
         of.values,
@@ -106,8 +105,8 @@ def draws(fit: Fit, of: Prepared, key: Key[Array, ""], count: int, kind: str) ->
         key=key,
         draws=count,
         kind=kind,
-        units={name: fit.model.parameter(name).unit for name in of.problem.free},
-        covariance=of.first_order.covariance[free, free] * np.outer(told, told),
+        units=linear.units,
+        covariance=linear.covariance,
     )
 
 

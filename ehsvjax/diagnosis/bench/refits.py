@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
-from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
+from ehsvjax.diagnosis.bench.workbench import ABREAST, TOLD_APART, Workbench
 
 _ITERATIONS = 60
 # A start is given up if so many steps like the next would not bring it to the best, so many times in a row: a kink
@@ -18,8 +18,6 @@ _PATIENCE = 4
 _STEEPEST = 1e100
 # How many times as long the steps are at which a refit begins where that many times as many are not few.
 _COARSER = 8
-# Starts whose derivatives are taken at once.
-_LINEARISED_TOGETHER = 8
 # Share of a step at which its curvature is taken, and of the step that its acceleration may be.
 _AHEAD, _MOST_BENT = 0.1, 0.75
 
@@ -163,8 +161,8 @@ def refit(
 
 def _linearised(bench: Workbench, at, trial, chosen):
     """Yield some starts, and the outputs and their derivatives at the trial of each, some at a time."""
-    for first in range(0, len(at), _LINEARISED_TOGETHER):
-        some = at[first : first + _LINEARISED_TOGETHER]
+    for first in range(0, len(at), ABREAST):
+        some = at[first : first + ABREAST]
         outputs, slopes = bench.linearised(trial[some], chosen[some])
         for row, i in enumerate(some):
             yield i, outputs[row], slopes[:, row]
@@ -203,6 +201,7 @@ def _bend(bench, noise, trial, running, points, chosen, kept, damping, lower, up
         assert here is not None
         along = np.where(chosen[i] >= 0, steps[row][own], 0.0)
         changed = noise.scaled(ahead[row] - (bench.problem.samples.outputs - here.residual))
+        # Made anew: kept for every start it would take as much memory as the slopes.
         jacobian = noise.scaled(here.slopes)
         curvature = 2.0 / _AHEAD * (changed / _AHEAD - along @ jacobian)
         if not np.isfinite(curvature).all():

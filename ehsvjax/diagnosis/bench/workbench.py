@@ -26,10 +26,10 @@ from ehsvjax.models.model import Model
 from ehsvjax.population import Coordinates, Problem, cast, simulated, to_unit, to_values
 from ehsvjax.record import Record
 
-# Simulated side by side: so few that a handful of points keeps all cores busy.
-_ABREAST = 8
-# Disturbances that are made at once.
-_TOGETHER = 32
+ABREAST = 8
+"""Simulated side by side: so few that a handful of points keeps all cores busy."""
+AT_ONCE = ABREAST * (os.cpu_count() or 1)
+"""Simulated by all cores together: what is made in such portions takes little memory, however long a record is."""
 ROUNDING = 3e-14
 """Of the outputs: a smaller change is none."""
 TOLD_APART = 3e-5
@@ -176,20 +176,20 @@ class Workbench:
         every = np.empty((len(points), *problem.samples.outputs.shape))
 
         def simulate(first: int) -> None:
-            some = points[first : first + _ABREAST]
+            some = points[first : first + ABREAST]
             added: Any = self._always_added
             if disturbances is not None:
                 added = np.array(added)
-                added[: len(some)] += disturbances[first : first + _ABREAST]
+                added[: len(some)] += disturbances[first : first + ABREAST]
             # The setting is that of a thread.
             with jax.enable_x64(True):
-                filled = jnp.asarray(_filled(some, _ABREAST))
+                filled = jnp.asarray(_filled(some, ABREAST))
                 acting = replace(problem, known=problem.known | self._acting(some))
                 outputs = _simulated(acting, filled, jnp.asarray(added))
-                every[first : first + _ABREAST] = np.asarray(outputs)[: len(some)]
+                every[first : first + ABREAST] = np.asarray(outputs)[: len(some)]
 
         # Taking the results raises what a simulation has raised.
-        list(_threads().map(simulate, range(0, len(points), _ABREAST)))
+        list(_threads().map(simulate, range(0, len(points), ABREAST)))
         # What comes after the end of a record is nothing, whatever the model would do there.
         every[:, ~self.present] = 0.0
         return every
@@ -211,7 +211,7 @@ class Workbench:
     def _always_added(self) -> Float[Array, "individual record time place"]:
         """What is added to signals in every simulation, side by side; to copy it takes as long as some simulations."""
         with jax.enable_x64(True):
-            return jnp.asarray(np.repeat(self.disturbances[None], _ABREAST, axis=0))
+            return jnp.asarray(np.repeat(self.disturbances[None], ABREAST, axis=0))
 
     @functools.cached_property
     def _on_device(self) -> Problem:
@@ -247,8 +247,8 @@ class Workbench:
         here = self.sketched(point[None])[0]
         # Single precision is far more than sketches are worth.
         changes = np.empty((count, *here.shape), np.float32)
-        for first in range(0, count, _TOGETHER):
-            rows = range(first, min(first + _TOGETHER, count))
+        for first in range(0, count, AT_ONCE):
+            rows = range(first, min(first + AT_ONCE, count))
             added = np.stack([disturbance(row) for row in rows])
             changes[first : rows.stop] = self.sketched(np.repeat(point[None], len(rows), axis=0), added) - here
         return changes

@@ -16,11 +16,9 @@ from jaxtyping import Float
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts, parts_at
 from ehsvjax.diagnosis.bench.refits import Refits, unexplained
-from ehsvjax.diagnosis.bench.workbench import Workbench, duration_of
+from ehsvjax.diagnosis.bench.workbench import AT_ONCE, Workbench, duration_of
 from ehsvjax.effects.effect import Candidate, Scales
 
-# Frequencies of which what they do is computed at once.
-_TOGETHER = 32
 # Frequencies of each effect that are tried.
 _TRIED = 3
 # Two frequencies differ if they drift apart by this many periods along the record; the search looks closer.
@@ -152,7 +150,7 @@ def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
             return parts.means(np.asarray(every(own, value, along)))
 
         # Some at a time: of a long record all of them take more memory than all else.
-        blocks = np.split(frequencies, range(_TOGETHER, len(frequencies), _TOGETHER))
+        blocks = np.split(frequencies, range(AT_ONCE, len(frequencies), AT_ONCE))
         means = [np.concatenate([means_of(n, some) for some in blocks]) for n in amplitudes]
     # Each record has amplitudes of its own.
     own = parts.of_record == np.arange(len(bench.records))[:, None]

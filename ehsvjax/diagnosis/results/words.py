@@ -279,7 +279,7 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
             low, high = g.share_interval
             share = round(100 * g.share_removed, 1)
             line += (
-                f"; {share}% of the removable error removed "
+                f"; {share:.1f}% of the removable error removed "
                 f"(95%: {100 * low:.1f} to {100 * high:.1f}{_MORE_THAN_ALL if share > 100.0 else ''})"
             )
         lines.append(line)
