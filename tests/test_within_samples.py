@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, lsim
 
-from ehsvjax import Model, Parameter, Record, Signal, runge_kutta_4, simulate
+from ehsvjax import Model, Parameter, Record, Signal, runge_kutta_4, servovalve, simulate
 from ehsvjax.effects import BANK, attach
 
 # So quick that much happens within a sample: frequency times period is 0.7, as of a good valve at 1 kHz.
@@ -94,3 +94,20 @@ def test_an_input_is_late_within_its_samples(effect, samples, plant, hold):
 @pytest.mark.parametrize(("declared", "share", "truth"), [("zero", 1.0, "linear"), ("linear", -1.0, "zero")])
 def test_an_input_runs_otherwise_within_its_samples(declared, share, truth):
     assert off("input_hold.share", share, response(*drawn(PUSH, truth)), declared) < 0.005
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_a_servovalve_needs_no_finer_steps_for_a_delayed_command(hold):
+    """Its step draws the command as a straight line: that line has the mean and the change of what the command does."""
+    command = np.repeat(np.random.default_rng(4).uniform(-3e-3, 3e-3, 20), 50)
+    record = Record(1e-3 * np.arange(len(command)), {"command": command}, hold=hold)
+    valve = attach(servovalve(), {"transport_delay.delay": (0.0, 0.01)}, duration=1.0, bank=BANK)
+
+    def error_of_a_step(delay):
+        coarse, fine = (
+            simulate(valve, record, {"transport_delay.delay": delay}, substeps=substeps)["position"]
+            for substeps in (4, 64)
+        )
+        return np.sqrt(np.mean((coarse - fine) ** 2))
+
+    assert error_of_a_step(2.37e-3) < 2.0 * error_of_a_step(0.0)
