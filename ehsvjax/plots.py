@@ -18,8 +18,9 @@ from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.linear import LinearModel
 from ehsvjax.models.model import Model
 from ehsvjax.precision.standard_errors import quantile_of
+from ehsvjax.quantities import NOT_FINITE, PREFIXES, prefix_of, quantity
 from ehsvjax.record import Record, checked_record
-from ehsvjax.summary import NOT_FINITE, percent_of_fit
+from ehsvjax.summary import percent_of_fit
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -48,8 +49,6 @@ _STYLE = {
 
 # Samples by which residuals are compared with themselves and with inputs.
 _LAGS = 25
-
-_PREFIXES = {"G": 1e9, "M": 1e6, "k": 1e3, "": 1.0, "m": 1e-3, "µ": 1e-6, "n": 1e-9}
 
 
 def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
@@ -317,8 +316,8 @@ def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
         for axes, name in zip(every, names, strict=False):
             profile, unit = found.profiles[name], found.units[name]
             estimate, error = found.estimates[name], found.standard_errors[name]
-            prefix = _prefix(abs(estimate), unit)
-            factor = _PREFIXES[prefix]
+            prefix = prefix_of(abs(estimate), unit)
+            factor = PREFIXES[prefix]
             if math.isfinite(error):
                 reach = 3.0 * error * np.array([-1.0, 1.0])
                 axes.plot((estimate + reach) / factor, [-3.0, 3.0], color=_MEASURED, ls=(0, (4, 3)))
@@ -576,8 +575,8 @@ def _share_time(axes, record: Record) -> None:
 def _scaled(values, unit: str) -> tuple[float, str]:
     """Return what to divide by, and the unit as it then reads in a label: metres of a few thousandths are in mm."""
     finite = np.abs(values[np.isfinite(values)])
-    prefix = _prefix(float(np.max(finite, initial=0.0)), unit)
-    return _PREFIXES[prefix], _plain(f"({prefix}{unit})") if unit else "(–)"
+    prefix = prefix_of(float(np.max(finite, initial=0.0)), unit)
+    return PREFIXES[prefix], _plain(f"({prefix}{unit})") if unit else "(–)"
 
 
 def _to_order_of_one(value: float, unit: str) -> tuple[float, str]:
@@ -597,19 +596,3 @@ def _words(name: str) -> str:
 def _plain(text: str) -> str:
     """Return a user's text as matplotlib draws it letter by letter, on one line: a dollar would begin a formula."""
     return " ".join(text.splitlines()).replace("$", r"\$")
-
-
-def quantity(value: float, unit: str) -> str:
-    """Return a value with its unit, in the prefix that reads best."""
-    if not math.isfinite(value):
-        return NOT_FINITE
-    prefix = _prefix(abs(value), unit)
-    return f"{value / _PREFIXES[prefix]:.3g} {prefix}{unit}".rstrip()
-
-
-def _prefix(largest: float, unit: str) -> str:
-    """Return the prefix that leaves a number of at least 1, for units that take one."""
-    if unit not in ("m", "m/s", "Pa", "N", "V", "A") or not 0.0 < largest < math.inf:
-        return ""
-    rounded = float(f"{largest:.3g}")
-    return next((prefix for prefix, factor in _PREFIXES.items() if rounded >= factor), "n")

@@ -12,11 +12,12 @@ from ehsvjax.linear import LinearModel
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.precision.directions import Direction
 from ehsvjax.precision.standard_errors import Precision
+from ehsvjax.quantities import NOT_FINITE, quantity
 from ehsvjax.record import Record
 
 
 def summary(fit: Fit) -> str:
-    """Return the model, records, statistics, parameters and warnings of a fit as text, SI units.
+    """Return the model, records, statistics, parameters and warnings of a fit as text: parameters in SI units.
 
     The sections are those of lmfit's fit report (Newville et al., lmfit-py).
     """
@@ -86,7 +87,6 @@ _UNKNOWN = "not known"
 _LARGE = 0.1
 # Per cent beyond which a figure says no more than that.
 _ABSURD = 1000.0
-NOT_FINITE = "not finite"
 # Noise variances below which what the integration is worth need not be told.
 _LEAST_WORTH = 0.001
 # Correlations that are printed, as in lmfit's reports.
@@ -130,7 +130,7 @@ def _sections(fit: Fit) -> Iterator[_Section]:
 
 
 def _model_sections(model: Model) -> Iterator[_Section]:
-    yield _Section("Model", [*_model_rows(model), ("longest step", _seconds(model.max_step))])
+    yield _Section("Model", [*_model_rows(model), ("longest step", quantity(model.max_step, "s"))])
     head = ("name", "symbol", "value", "unit", "bounds")
     for title, parameters in (("Parameters", model.parameters), ("Initial conditions", model.initial)):
         if parameters:
@@ -205,7 +205,7 @@ def _method_rows(effort: Effort) -> list[tuple[str, str]]:
 
 
 def _integration(step_size: float, effort: Effort) -> str:
-    words = [f"steps of {_seconds(step_size)}"]
+    words = [f"steps of {quantity(step_size, 's')}"]
     if effort.arithmetic is not None:
         words.append(f"worth {_worth(effort.arithmetic)}")
     if effort.left_out:
@@ -219,13 +219,6 @@ def _worth(variances: float) -> str:
         return "more than can be said, half a step is not finite"
     size = f"{variances:.2g}" if variances >= _LEAST_WORTH else f"less than {_LEAST_WORTH:g}"
     return f"{size} noise variances"
-
-
-def _seconds(value: float) -> str:
-    """Return a time of integration steps in the unit that leaves a number of at least a tenth."""
-    units = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
-    factor, unit = next((pair for pair in units if value >= 0.1 * pair[0]), units[-1])
-    return f"{value / factor:.3g} {unit}"
 
 
 def _search(effort: Effort) -> str:
@@ -252,7 +245,12 @@ def _output_rows(fit: Fit) -> Sequence[tuple[str, ...]]:
     deviation = {name: math.sqrt(variance) for name, variance in fit.noise_variance.items()}
     units = {name: fit.model.unit(name) for name in fit.outputs}
     return [
-        (name, _quantity(rmse[name], unit), percent_of_fit(fit_percent[name]), _quantity(deviation[name], unit))
+        (
+            name,
+            quantity(rmse[name], unit, digits=4),
+            percent_of_fit(fit_percent[name]),
+            quantity(deviation[name], unit, digits=4),
+        )
         for name, unit in units.items()
     ]
 
@@ -282,10 +280,6 @@ def _prior_row(fit: Fit, precision: Precision | str, parameter: Parameter) -> tu
     apart = abs(other - mean) / math.hypot(information**-0.5, deviation)
     words = f"{apart:.1f} standard deviations apart" + (": they contradict each other" if apart > _CONTRADICTED else "")
     return *row, f"{other:.6g} +/- {information**-0.5:.3g}", words
-
-
-def _quantity(value: float, unit: str) -> str:
-    return f"{value:.3e} {unit}" if math.isfinite(value) else NOT_FINITE
 
 
 def percent_of_fit(percent: float) -> str:

@@ -240,6 +240,9 @@ def test_the_misfit_is_in_finite_numbers(diagnosis):
     assert np.isfinite(misfit.in_time).all() and np.isfinite(misfit.in_frequency).all()
     for profile in misfit.against.values():
         assert np.isfinite(profile).all()
+        # A constant offset lies in every bin; the extended model leaves none.
+        assert np.sqrt(np.mean((profile.mean / profile.deviation) ** 2)) > 4.0
+        assert np.sqrt(np.mean((profile.mean_after / profile.deviation) ** 2)) < 2.0
     assert {"time", "command", "position"} <= set(misfit.against)
     assert misfit.whiteness < 1e-6 and not misfit.coloured and not misfit.outliers.any() and misfit.lattice is None
     assert diagnosis.misfit.tests[0].corrected < 1e-6
@@ -332,7 +335,14 @@ def test_every_axis_of_the_picture_says_what_it_shows(diagnosis):
     assert series.get_ylabel() == "residual of\nposition (–)" and spectrum.get_ylabel() == "power (1/Hz)"
     assert profiles[0].get_ylabel() == "mean residual (–)"
     assert all(re.search(r"\(.+\)", axes.get_xlabel()) for axes in figure.axes)
-    assert "sensor bias" in [label.get_text() for label in suspects.get_yticklabels()]
+    assert suspects.get_yticklabels()[-1].get_text() == "sensor bias"
+    lengths = [bar.get_width() for bar in suspects.patches]
+    assert lengths == sorted(lengths) and lengths[-1] > suspects.lines[0].get_xdata()[0] > 3.0
+    # What the extended model leaves lies beside what the model leaves, wherever the misfit is shown.
+    assert [text.get_text() for text in spectrum.get_legend().get_texts()] == ["residual", "extended", "noise"]
+    for axes in profiles:
+        model, extended, _ = axes.lines
+        assert np.abs(extended.get_ydata()).max() < 0.3 * np.abs(model.get_ydata()).max()
     assert [text.get_text() for text in series.get_legend().get_texts()] == [
         "the model",
         "extended",
@@ -355,6 +365,7 @@ def test_the_extended_fit_is_adequate_on_the_same_record(diagnosis, record):
     assert effects_of(diagnosis.extended.model) == ("sensor_bias",)
     again = ehsvjax.diagnose(diagnosis.extended, record, key=KEY)
     assert again.verdict == "adequate", str(again)
+    assert "suspects: nothing here is significant" in [axes.get_title(loc="left") for axes in again.plot().axes]
     assert again.names == () and again.innocent and again.missing is None
     assert not again.table["included"].any()
     assert effects_of(again.extended.model) == ("sensor_bias",)

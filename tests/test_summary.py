@@ -28,8 +28,8 @@ SUMMARY = """\
     unknowns            1 parameter
     cost, equation (9)  0.015 N^2 s
 [[Outputs]]
-    output  rmse         fit      noise standard deviation
-    force   1.000e-01 N  96.02 %  1.000e-01 N
+    output  rmse    fit      noise standard deviation
+    force   100 mN  96.02 %  100 mN
 [[Parameters]]
     name         symbol  value  standard error      unit  bounds
     gain         k       2      +/- 0.0267 (1.34%)  N/V   0.5 .. 5
@@ -80,8 +80,8 @@ def test_several_outputs_are_listed_and_their_costs_weighed():
     # Force: 0.03*0.5/0.01; strain: four errors of 1e-4, 4e-8*0.5/1e-8.
     text = summary(hand_made.fit(hand_made.record_of_both()))
     assert "3.5 s (each output over its noise variance)" in text
-    assert "    force   1.000e-01 N    96.02 %  1.000e-01 N\n" in text
-    assert "    strain  1.000e-04 m/m  95.53 %  1.000e-04 m/m\n" in text
+    assert "    force   100 mN      96.02 %  100 mN\n" in text
+    assert "    strain  0.0001 m/m  95.53 %  0.0001 m/m\n" in text
 
 
 @pytest.mark.parametrize(("unit", "shown"), [("N", "N^2 s"), ("", "s"), ("m/m", "(m/m)^2 s")])
@@ -118,10 +118,10 @@ def test_effort_is_told_as_it_was():
     ("effort", "words"),
     [
         ({"step_size": 2.5e-4, "arithmetic": 0.0096, "left_out": 53},
-         "steps of 0.25 ms; worth 0.0096 noise variances; 53 readings that it cannot know left out"),
+         "steps of 250 µs; worth 0.0096 noise variances; 53 readings that it cannot know left out"),
         ({"step_size": 0.02, "arithmetic": 3e-9}, "steps of 20 ms; worth less than 0.001 noise variances"),
         ({"step_size": 7.8125e-7, "arithmetic": 312.4, "left_out": 1},
-         "steps of 0.781 µs; worth 3.1e+02 noise variances; 1 reading that it cannot know left out"),
+         "steps of 781 ns; worth 3.1e+02 noise variances; 1 reading that it cannot know left out"),
         ({"step_size": 1.0, "arithmetic": math.inf},
          "steps of 1 s; worth more than can be said, half a step is not finite"),
         ({"step_size": 5e-6}, "steps of 5 µs"),

@@ -108,6 +108,7 @@ def _diagnosed(
         causes=causes_of(selection, verdict, examined.chance, wider),
         alternatives=verdict.alternatives,
         table=table_of(selection),
+        significant_score=selection.stages[0].screening.threshold,
         extended=wider,
         gain=gain,
         misfit=misfit_of(examined, outliers),

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from ehsvjax.experiment import commands
 from ehsvjax.experiment.commands import Reach
 from ehsvjax.models.model import Model
-from ehsvjax.plots import quantity
+from ehsvjax.quantities import quantity
 from ehsvjax.record import Record
 
 # Genes of plain commands: every kind at these amplitudes and time scales, in the middle of its limits, of fixed levels.

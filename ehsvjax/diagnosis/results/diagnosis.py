@@ -46,6 +46,8 @@ class Diagnosis:
         alternatives: for each cause that is not alone: all that could be there instead, itself among them.
         table: every candidate: signal, size, unit, score, p-values, likelihood gain, smallest size that the record
             could have shown, and what it is confounded with.
+        significant_score: that the best of all candidates exceeds in 0.2% of records of noise; one-sided effects and
+            waves, of which the frequency is searched, have their own.
         extended: the fit of the extended model; the refitted nominal one where nothing was found.
         gain: on data that were not used for fitting.
         misfit: what the nominal model gets wrong.
@@ -67,6 +69,7 @@ class Diagnosis:
     causes: tuple[Cause, ...]
     alternatives: tuple[Alternative, ...]
     table: "pandas.DataFrame"
+    significant_score: float
     extended: Fit
     gain: Gain
     misfit: Misfit

@@ -16,18 +16,26 @@ _WINDOWS = 20
 
 
 class Profile(NamedTuple):
-    """Mean residual by a quantity: `[bin]` its middle, the mean, and the mean's deviation under noise alone."""
+    """Mean residual by a quantity: `[bin]` its middle, the mean, and the mean's deviation under noise alone.
+
+    `mean_after` is that of the extended model, the same where nothing was added.
+    """
 
     middle: Float[np.ndarray, " bin"]
     mean: Float[np.ndarray, " bin"]
+    mean_after: Float[np.ndarray, " bin"]
     deviation: Float[np.ndarray, " bin"]
 
 
 class Spectrum(NamedTuple):
-    """Power by frequency, Hz, of the residual and of the noise that the diagnosis counts on, unit^2/Hz."""
+    """Power by frequency, Hz, of the residual and of the noise that the diagnosis counts on, unit^2/Hz.
+
+    `residual_after` is that of the extended model, the same where nothing was added.
+    """
 
     frequency: Float[np.ndarray, " frequency"]
     residual: Float[np.ndarray, " frequency"]
+    residual_after: Float[np.ndarray, " frequency"]
     noise: Float[np.ndarray, " frequency"]
 
 
@@ -110,7 +118,10 @@ def _of_record(
         if name not in bench.records[record].outputs:
             continue
         measured = samples.measured[record, present, i]
-        residual = np.where(measured, selection.nominal.residual[0, record, present, i], np.nan)
+        residual, after = (
+            np.where(measured, refits.residual[0, record, present, i], np.nan)
+            for refits in (selection.nominal, selection.final)
+        )
         noise = selection.noise.of[record][i]
         found = residual_noise(
             np.nan_to_num(residual)[None] / np.nanstd(residual), measured[None], "white"
@@ -123,9 +134,9 @@ def _of_record(
             above_noise=float(np.clip(1.0 - noise.variance / square, 0.0, 1.0)),
             residual=residual,
             in_time=_in_time(residual) / noise.variance**0.5,
-            in_frequency=_in_frequency(residual, noise, float(samples.sample_period[record])),
+            in_frequency=_in_frequency(residual, after, noise, float(samples.sample_period[record])),
             against={
-                quantity: _against(residual, series[record, present], noise)
+                quantity: _against(residual, after, series[record, present], noise)
                 for quantity, series in selection.seen.items()
                 if np.ptp(series[record, present]) > 0
             },
@@ -142,30 +153,32 @@ def _in_time(residual) -> Float[np.ndarray, " window"]:
     return np.array([np.sqrt(np.nanmean(w**2)) if np.isfinite(w).any() else np.nan for w in windows])
 
 
-def _in_frequency(residual, noise, period) -> Spectrum:
+def _in_frequency(residual, after, noise, period) -> Spectrum:
     from scipy.signal import welch
 
-    length = min(len(residual), 1024)
     # A straight line across what is missing: a jump to zero and back would pass for noise at every frequency.
     at, kept = np.arange(len(residual)), np.isfinite(residual)
-    frequency, power = welch(np.interp(at, at[kept], residual[kept]), 1.0 / period, nperseg=length)
+    whole = np.array([np.interp(at, at[kept], series[kept]) for series in (residual, after)])
+    frequency, (power, power_after) = welch(whole, 1.0 / period, nperseg=min(len(residual), 1024))
     angle = np.exp(-2j * np.pi * frequency * period)
     response = 1.0 - sum(c * angle ** (k + 1) for k, c in enumerate(noise.coefficients))
     noise_power = 2.0 * period * noise.innovation_variance / np.abs(response) ** 2
-    return Spectrum(frequency[1:], power[1:], np.broadcast_to(noise_power, frequency.shape)[1:])
+    noise_power = np.broadcast_to(noise_power, frequency.shape)
+    return Spectrum(frequency[1:], power[1:], power_after[1:], noise_power[1:])
 
 
-def _against(residual, series, noise) -> Profile:
+def _against(residual, after, series, noise) -> Profile:
     edges = knots_along(series, _BINS + 1)
     which = np.clip(np.searchsorted(edges, series, side="right") - 1, 0, len(edges) - 2)
     kept = np.isfinite(residual)
-    middle, mean, deviation = [], [], []
+    middle, mean, mean_after, deviation = [], [], [], []
     for b in range(len(edges) - 1):
         inside = kept & (which == b)
         count = int(inside.sum())
         if count:
             middle.append(float(np.mean(series[inside])))
             mean.append(float(np.mean(residual[inside])))
+            mean_after.append(float(np.mean(after[inside])))
             # Correlated samples tell less of a mean.
             deviation.append(float(np.sqrt(noise.variance * min(noise.correlation_samples, count) / count)))
-    return Profile(np.array(middle), np.array(mean), np.array(deviation))
+    return Profile(*map(np.array, (middle, mean, mean_after, deviation)))

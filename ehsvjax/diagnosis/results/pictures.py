@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results import words
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
@@ -13,15 +14,14 @@ from ehsvjax.plots import (
     _COMMAND,
     _MEASURED,
     _MODEL,
-    _PREFIXES,
     _figure,
     _legend,
     _plain,
-    _prefix,
     _scaled,
     _style,
     _words,
 )
+from ehsvjax.quantities import PREFIXES, prefix_of
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -63,6 +63,7 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
     there = [k for k, outputs in enumerate(diagnosis.misfit.by_record) if name in outputs]
     found = [diagnosis.misfit.by_record[k][name] for k in there]
     unit = diagnosis.fit.model.unit(name)
+    extended = diagnosis.extended.model.name != diagnosis.fit.model.name
     grid = part.add_gridspec(2, _PANELS, height_ratios=[1.0, 1.1])
     series, spectrum = part.add_subplot(grid[0, :2]), part.add_subplot(grid[0, 2])
     factor, label = _scaled(np.concatenate([m.residual for m in found]), unit)
@@ -76,7 +77,7 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
             ("the model", "extended", "95% of the noise") if k == there[0] else (None, None, None)
         )
         series.plot(time, m.residual / factor, color=_MEASURED, label=of_model, **dots)
-        if diagnosis.extended.model is not diagnosis.fit.model:
+        if extended:
             after = np.where(np.isnan(m.residual), np.nan, diagnosis.extended.residuals(record)[name])
             series.plot(time, after / factor, color=_MODEL, label=of_extended, **dots)
         reach, ends = 1.96 * m.noise_floor / factor, time[-1] + record.sample_period
@@ -86,6 +87,8 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
         begins = ends
         shown = m.in_frequency
         spectrum.loglog(shown.frequency, shown.residual, color=_MEASURED, label=of_model and "residual")
+        if extended:
+            spectrum.loglog(shown.frequency, shown.residual_after, color=_MODEL, label=of_extended)
         spectrum.loglog(shown.frequency, shown.noise, color=_COMMAND, label=of_noise and "noise")
     along = "time (s)" if len(there) == 1 else "time, records one after the other (s)"
     series.set(xlabel=along, ylabel=f"residual of\n{_words(name)} {label}")
@@ -104,10 +107,13 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
                 profile.middle / across, -1.96 * profile.deviation / mean, 1.96 * profile.deviation / mean,
                 color=_COMMAND, alpha=0.15, lw=0,
             )  # fmt: skip
+            marker = {"marker": _MARKERS[k % len(_MARKERS)], "ms": 4}
             axes.plot(
-                profile.middle / across, profile.mean / mean, color=_MEASURED, marker=_MARKERS[k % len(_MARKERS)], ms=4,
+                profile.middle / across, profile.mean / mean, color=_MEASURED, **marker,
                 label=_plain(diagnosis.records[k].name) if len(there) > 1 and not panel else None,
             )  # fmt: skip
+            if extended:
+                axes.plot(profile.middle / across, profile.mean_after / mean, color=_MODEL, **marker)
         if len(there) > 1 and not panel:
             _legend(axes)
         axes.axhline(0.0, color=_AXIS, lw=0.8)
@@ -127,7 +133,8 @@ def _most_telling(each) -> list[str]:
 
 def _draw_suspects(axes, diagnosis: Diagnosis) -> None:
     table = diagnosis.table
-    table = table[np.isfinite(table["score"].astype(float))].drop_duplicates("cause").head(_SUSPECTS)[::-1]
+    table = table[np.isfinite(table["score"].astype(float))].drop_duplicates("cause").head(_SUSPECTS)
+    table = table.sort_values("score", key=lambda scores: scores.astype(float).abs())
     within = {name for a in diagnosis.alternatives for name in a.causes} | set(diagnosis.names)
     colours = [_MODEL if cause in within else _MEASURED for cause in table["cause"]]
     scores = table["score"].astype(float).abs()
@@ -135,7 +142,12 @@ def _draw_suspects(axes, diagnosis: Diagnosis) -> None:
     axes.set_yticks(range(len(table)), [_words(cause) for cause in table["cause"]], fontsize=8)
     if scores.max() > _FAR:
         axes.set_xscale("symlog", linthresh=5.0)
-    axes.set(xlabel="score on the nominal model (standard deviations)", title="suspects")
+    axes.axvline(diagnosis.significant_score, color=_AXIS, lw=0.8, ls="--")
+    significant = (table["p_corrected"] < SIGNIFICANT).any()
+    axes.set(
+        xlabel="score on the nominal model (standard deviations); dashed: beyond chance",
+        title="suspects" if significant else "suspects: nothing here is significant",
+    )
     axes.grid(axis="y", visible=False)
 
 
@@ -143,8 +155,8 @@ def _draw_missing(axes, diagnosis: Diagnosis) -> None:
     m = diagnosis.missing
     assert m is not None
     factor, label = _scaled(m.at, m.quantity_unit)
-    prefix = "" if m.relative else _prefix(float(np.max(np.abs(m.estimate))), m.unit)
-    size = 0.01 if m.relative else _PREFIXES[prefix]
+    prefix = "" if m.relative else prefix_of(float(np.max(np.abs(m.estimate))), m.unit)
+    size = 0.01 if m.relative else PREFIXES[prefix]
     unit = "%" if m.relative else f"{prefix}{m.unit}" or "–"
     low, high = (m.estimate + side * 1.96 * m.deviation for side in (-1.0, 1.0))
     axes.fill_between(m.at / factor, low / size, high / size, color=_MODEL, alpha=0.2, lw=0)

@@ -8,6 +8,7 @@ import numpy as np
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, how_sure
+from ehsvjax.quantities import quantity
 
 if TYPE_CHECKING:
     from ehsvjax.diagnosis.results.diagnosis import Diagnosis
@@ -38,7 +39,7 @@ def integration_line(diagnosis: "Diagnosis") -> str:
     unknown = f"; readings that it cannot know, as beside a jump, carry no weight: {readings}" if readings else ""
     much = "" if worth < 1.0 else ": more than it should; simulate the model with a method for stiff equations"
     return (
-        f"simulated in steps of {1e3 * step:.3g} ms: at half of it no comparison changes by more than "
+        f"simulated in steps of {quantity(step, 's')}: at half of it no comparison changes by more than "
         f"{max(worth, 0.01):.2g} noise variances{much}{unknown}"
     )
 
@@ -113,8 +114,8 @@ def _brief(diagnosis: "Diagnosis", cause: Cause) -> str:
         return ""
     waves = {size.number: size.value for size in cause.sizes}
     if {"cosine", "sine"} <= set(waves):
-        return f"{np.hypot(waves['cosine'], waves['sine']):.3g}{_spaced(cause.sizes[0].unit)}"
-    return f"{cause.sizes[0].value:.3g}{_spaced(cause.sizes[0].unit)}"
+        return quantity(np.hypot(waves["cosine"], waves["sine"]), cause.sizes[0].unit)
+    return quantity(cause.sizes[0].value, cause.sizes[0].unit)
 
 
 def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
@@ -123,19 +124,25 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
     # What was fitted to these very records is refitted to where it was.
     as_fitted = set(diagnosis.records) == set(diagnosis.fit.records)
     for record, name, m in _of_each(_names(diagnosis), diagnosis.misfit.by_record):
-        unit = _spaced(diagnosis.fit.model.unit(name))
+        unit = diagnosis.fit.model.unit(name)
         kind = "coloured" if m.coloured else "white"
-        predicted = "" if as_fitted else f"rmse {m.rmse_predicted:.4g}{unit} as it was fitted; refitted "
+        before, rmse, noise = (quantity(x, unit, digits=4) for x in (m.rmse_predicted, m.rmse, m.noise_floor))
+        predicted = "" if as_fitted else f"rmse {before} as it was fitted; refitted "
         lines.append(
-            f"{record}{name}: {predicted}rmse {m.rmse:.4g}{unit}, of which the noise ({kind}) is {m.noise_floor:.4g}: "
+            f"{record}{name}: {predicted}rmse {rmse}, of which the noise ({kind}) is {noise}: "
             f"{100 * m.above_noise:.1f}% of the squared error is misfit"
         )
         if m.outliers.any():
-            lines.append(f"  {int(m.outliers.sum())} readings stand alone; they were left out")
-        if m.lattice is not None:
-            share = m.lattice**2 / 12.0 / m.noise_floor**2
+            alone = int(m.outliers.sum())
             lines.append(
-                f"  the readings lie on a lattice of {m.lattice:.3g}{unit}: {100 * min(share, 1.0):.0f}% of the noise"
+                f"  {alone} readings stand alone; they were left out"
+                if alone > 1
+                else "  1 reading stands alone; it was left out"
+            )
+        if m.lattice is not None:
+            share = min(m.lattice**2 / 12.0 / m.noise_floor**2, 1.0)
+            lines.append(
+                f"  the readings lie on a lattice of {quantity(m.lattice, unit)}: {100 * share:.0f}% of the noise"
             )
     known = [p.name for p in diagnosis.fit.model.parameters if p.prior]
     if known:
@@ -157,15 +164,15 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
         lines += _not_sure(diagnosis)
     m = diagnosis.missing
     if m is not None:
-        unit = _spaced("of its value" if m.relative else m.unit)
+        unit = "of its value" if m.relative else m.unit
         peak = int(np.argmax(np.abs(m.estimate)))
         # Several causes may stand for one that the bank lacks.
         instead = diagnosis.innocent and diagnosis.verdict != "unexplained"
         along = f"as a function of {m.quantity}{_repeating(m.period, m.quantity_unit)}"
         lines.append(
             f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, {along}: "
-            f"up to {m.estimate[peak]:.3g} +/- {m.deviation[peak]:.2g}{unit} at {m.at[peak]:.3g}"
-            f"{_spaced(m.quantity_unit)}; it takes {100 * m.explained:.0f}% of what is left (see .missing and .plot())"
+            f"up to {quantity(m.estimate[peak], unit, m.deviation[peak])} at {quantity(m.at[peak], m.quantity_unit)}"
+            f"; it takes {100 * m.explained:.0f}% of what is left (see .missing and .plot())"
         )
         if m.alike:
             others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
@@ -216,10 +223,7 @@ def _number_words(cause: Cause, number: str) -> str:
     """Return one number of a cause with its standard error, of each record where each has its own."""
     each = [size for size in cause.sizes if size.number == number]
     values = ", ".join(
-        f"{s.value:.4g}"
-        + (f" +/- {s.standard_error:.2g}" if np.isfinite(s.standard_error) else "")
-        + _spaced(s.unit)
-        + (f" in {s.record}" if s.record is not None else "")
+        quantity(s.value, s.unit, s.standard_error, 4) + (f" in {s.record}" if s.record is not None else "")
         for s in each
     )
     return f"{number} {values}"
@@ -232,10 +236,8 @@ def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
         return ""
     size = cause.sizes[0]
     factor, offset = (given.value, given.value) if size.number == "error" else (1.0, 0.0)
-    return (
-        f"{cause.name}: {offset + factor * size.value:.4g} +/- {factor * size.standard_error:.2g}{_spaced(given.unit)} "
-        f"instead of the {given.value:.4g} that was given"
-    )
+    there = quantity(offset + factor * size.value, given.unit, factor * size.standard_error, 4)
+    return f"{cause.name}: {there} instead of the {quantity(given.value, given.unit, digits=4)} that was given"
 
 
 def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Any]]:
@@ -264,16 +266,14 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
         for name, left_open in zip(_told(gain.records), gain.left_open, strict=True)
     ]
     for record, name, g in _of_each(names, gain.by_record):
-        unit = _spaced(diagnosis.fit.model.unit(name))
+        unit = diagnosis.fit.model.unit(name)
+        before, after, noise = (quantity(x, unit, digits=4) for x in (g.rmse_before, g.rmse_after, g.noise_floor))
         if diagnosis.extended.model.name == diagnosis.fit.model.name:
-            lines.append(
-                f"on {diagnosis.gain.on}: {record}{name} rmse {g.rmse_before:.4g}{unit}, noise "
-                f"{g.noise_floor:.4g}{unit}"
-            )
+            lines.append(f"on {diagnosis.gain.on}: {record}{name} rmse {before}, noise {noise}")
             continue
         line = (
-            f"on {diagnosis.gain.on}: {record}{name} rmse {g.rmse_before:.4g} -> {g.rmse_after:.4g}{unit} "
-            f"(noise {g.noise_floor:.4g}), fit {g.fit_before:.2f} -> {g.fit_after:.2f}%"
+            f"on {diagnosis.gain.on}: {record}{name} rmse {before} -> {after} (noise {noise}), "
+            f"fit {g.fit_before:.2f} -> {g.fit_after:.2f}%"
         )
         if np.isfinite(g.share_removed):
             low, high = g.share_interval
@@ -297,7 +297,7 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
     if diagnosis.verdict == "unexplained":
         lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
     if diagnosis.verdict == "adequate":
-        said = "; ".join(f"{e.cause} above {e.above:.2g}{_spaced(e.unit)}" for e in diagnosis.excluded[:_NAMED])
+        said = "; ".join(f"{e.cause} above {quantity(e.above, e.unit, digits=2)}" for e in diagnosis.excluded[:_NAMED])
         more = len(diagnosis.excluded) - _NAMED
         lines.append(
             f"excluded, as it would be found in 95% of such records: {said}"
@@ -314,11 +314,7 @@ def these(diagnosis: "Diagnosis") -> str:
 
 
 def _repeating(period: float | None, unit: str) -> str:
-    return "" if period is None else f", repeating every {period:.3g}{_spaced(unit)}"
-
-
-def _spaced(unit: str) -> str:
-    return f" {unit}" if unit else ""
+    return "" if period is None else f", repeating every {quantity(period, unit)}"
 
 
 def _p(p: float) -> str:
