@@ -229,7 +229,7 @@ def library(model: str, seed: int, samples: int) -> dict[str, Variants]:
     every frequency that the record tells from the next.
     """
     command, period = excitation(model, seed)
-    without, variants = nominal(model, seed, samples), _variants(model, samples * period)
+    without, variants = nominal(model, seed, samples), variants_of(model, samples * period)
     effects = [{name: sizes} for name, some in variants.items() for sizes in some]
     points = np.tile(_identified(model)[0], (len(effects), 1))
     left = np.array([without.outside(row) for row in _positions(model, command[:samples], points, effects)])
@@ -240,7 +240,7 @@ def library(model: str, seed: int, samples: int) -> dict[str, Variants]:
     }
 
 
-def _variants(model: str, duration: float) -> dict[str, list[dict[str, float]]]:
+def variants_of(model: str, duration: float) -> dict[str, list[dict[str, float]]]:
     """Return sizes of each effect of a bank, for a record of a duration, s."""
     ranges = {n: r for n, r in effect_sizes(model).items() if n != "process_noise" and not n.startswith("unknown")}
     found = {
