@@ -87,7 +87,7 @@ def test_a_fit_says_which_step_and_how_many_readings_are_left_out(valve):
     fit = ehsvjax.identify(ehsvjax.servovalve(), valve.record, key=KEY, population=50, generations=20)
     assert 0 < fit.effort.left_out <= 0.03 * 2 * SAMPLES
     assert fit.effort.arithmetic <= 0.05
-    assert f"{fit.effort.left_out}" in str(fit) and f"{1e3 * fit.effort.step_size:.3g} ms" in str(fit)
+    assert f"{fit.effort.left_out}" in str(fit) and f"{1e6 * fit.effort.step_size:.3g} µs" in str(fit)
     for name, deviation in NOISE.items():
         # Of 2,000 readings the standard deviation is known to 1.6%.
         assert fit.noise_variance[name] ** 0.5 == pytest.approx(deviation, rel=0.08), name

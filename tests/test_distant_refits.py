@@ -55,7 +55,7 @@ def led_to(bench, constant):
     noise = plain_noise(np.array([1e-8]), bench.problem.samples.measured)
     trials = trials_of(bench, lambda stage, done: None)
     current = refit_sets(trials, [[bench.nominal]], [()], noise)
-    tried = responses_at(bench, current, (), noise, trials.parts)
+    tried = responses_at(bench, current, (), noise, trials.waves)
     names = {bench.candidates[s.candidate].name: s for s in screen(bench, current, tried, noise, 1).ranked}
     screened = names[constant]
     (column,) = bench.columns_of(bench.candidates[screened.candidate])

@@ -156,7 +156,7 @@ def _refitted_from(
     Also from where all else is as it is with it.
     """
     bench = trials.bench
-    screening = screen(bench, base, responses_at(bench, base, rest, noise, trials.parts), noise, 1)
+    screening = screen(bench, base, responses_at(bench, base, rest, noise, trials.waves), noise, 1)
     # What all records share is no worse an explanation for what each could have for itself.
     able = [s for s in screening.ranked if bench.of_each(own) or not bench.of_each(s.candidate)]
     close = [s for s in _close(able, own) if fits(bench, (*rest, s.candidate))]

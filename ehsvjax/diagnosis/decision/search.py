@@ -258,7 +258,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
         bench = trials.bench
         measured = bench.problem.samples.measured
         tried = responses_at(
-            bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.parts
+            bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.waves
         )
         spanned = current.slopes[0], tried.changes, trials.terms.responses
         noise = noise_outside(current.residual[0], measured, spanned)
@@ -268,7 +268,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
             break
     if noise.coloured or noise.variances.size > 1:
         current = refit_set(trials, current.points[0], included, noise)
-        tried = responses_at(bench, current, included, noise, trials.parts)
+        tried = responses_at(bench, current, included, noise, trials.waves)
     else:
         # The variance of one record's and output's white noise does not move the best fit.
         current = current._replace(cost=np.array([_cost_under(current, noise)]))

@@ -7,6 +7,7 @@ themselves, their own frequency and its multiples are left out: what goes by the
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,13 +30,38 @@ _PERIODS_PER_PART = 0.35
 _LEAST_PERIODS, _ALIKE = 4, 0.99
 
 
-def parts_of(bench: Workbench) -> dict[str, Parts]:
-    """Return the responses to parts of a disturbance at every signal that a harmonic effect could disturb."""
-    places = dict.fromkeys(c.signal for c in bench.candidates if _by_parts(bench, c))
-    return {place: parts_at(bench, bench.nominal, place) for place in places}
+class Waves(NamedTuple):
+    """What a harmonic effect adds to its signal at each frequency that parts of the record are short enough for.
+
+    Attributes:
+        parts: of the record, and what a disturbance of the signal over each of them does.
+        edge: the frequency from which on the parts are too long, rad/s.
+        frequencies: below it, rad/s.
+        shares: what each of the effect's amplitudes adds to the signal in each part.
+
+    """
+
+    parts: Parts
+    edge: float
+    frequencies: Float[np.ndarray, " frequency"]
+    shares: Float[np.ndarray, "frequency amplitude part"]
 
 
-def with_frequencies(bench: Workbench, current: Refits, noise: Noise, parts: Mapping[str, Parts]) -> Workbench:
+def waves_of(bench: Workbench) -> dict[str, Waves]:
+    """Return the waves of every harmonic effect whose sum of parts is known, by the candidate's name."""
+    some = [c for c in bench.candidates if _by_parts(bench, c)]
+    parts = {place: parts_at(bench, bench.nominal, place) for place in dict.fromkeys(c.signal for c in some)}
+    found = {}
+    for candidate in some:
+        there = parts[candidate.signal]
+        lowest, highest = _range_of(bench, candidate)
+        edge = min(highest, 2.0 * np.pi * _PERIODS_PER_PART / there.length)
+        frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration_of(bench.records))
+        found[candidate.name] = Waves(there, edge, frequencies, _shares(bench, candidate, frequencies, there))
+    return found
+
+
+def with_frequencies(bench: Workbench, current: Refits, noise: Noise, waves: Mapping[str, Waves]) -> Workbench:
     """Return the bench with the frequencies at which each harmonic effect is to be tried."""
     duration = duration_of(bench.records)
     known, r = unexplained(current, noise.innovations)
@@ -45,15 +71,12 @@ def with_frequencies(bench: Workbench, current: Refits, noise: Noise, parts: Map
         if not candidate.effect.harmonic:
             continue
         own = bench.scales[candidate.name]
-        (frequency,) = (p for p in candidate.effect.parameters if p.name == "frequency")
-        lowest, highest = frequency.lower(own), frequency.upper(own)
+        lowest, highest = _range_of(bench, candidate)
         peaks: list[tuple[float, float]] = []
-        if _by_parts(bench, candidate):
-            there = parts[candidate.signal]
-            edge = min(highest, 2.0 * np.pi * _PERIODS_PER_PART / there.length)
-            frequencies = np.arange(lowest, edge, 2.0 * np.pi * _CLOSE / duration)
-            peaks += _peaks(frequencies, _explained(bench, candidate, frequencies, noise, known, r, there))
-            lowest = edge
+        if candidate.name in waves:
+            there = waves[candidate.name]
+            peaks += _peaks(there.frequencies, _explained(there, noise, known, r))
+            lowest = there.edge
         # A record that does not hold the first output says nothing of it.
         for k in np.flatnonzero(bench.problem.samples.measured[..., 0].any(axis=1)).tolist():
             peaks += _peaks(*_periodogram(bench, current, k, lowest, highest))
@@ -111,15 +134,19 @@ def _by_parts(bench: Workbench, candidate: Candidate) -> bool:
     return candidate.effect.harmonic and candidate.signal in bench.places and not candidate.effect.memory
 
 
-def _explained(
-    bench: Workbench, candidate: Candidate, frequencies, noise: Noise, known, r, parts: Parts
-) -> Float[np.ndarray, " frequency"]:
+def _range_of(bench: Workbench, candidate: Candidate) -> tuple[float, float]:
+    """Return the lowest and the highest frequency of a harmonic effect, rad/s."""
+    scales = bench.scales[candidate.name]
+    (frequency,) = (p for p in candidate.effect.parameters if p.name == "frequency")
+    return frequency.lower(scales), frequency.upper(scales)
+
+
+def _explained(waves: Waves, noise: Noise, known, r) -> Float[np.ndarray, " frequency"]:
     """Return the noise variances of the residual that an effect would take at each frequency, to first order."""
-    changes = noise.innovations(parts.responses)
+    changes = noise.innovations(waves.parts.responses)
     changes = changes - (changes @ known) @ known.T
-    shares = _shares(bench, candidate, frequencies, parts)
-    along = shares @ (changes @ r)
-    information = np.einsum("fap,pq,fbq->fab", shares, changes @ changes.T, shares, optimize=True)
+    along = waves.shares @ (changes @ r)
+    information = np.einsum("fap,pq,fbq->fab", waves.shares, changes @ changes.T, waves.shares, optimize=True)
     # An amplitude that does not show takes nothing.
     return np.einsum("fa,fab,fb->f", along, np.linalg.pinv(information, rcond=1e-9, hermitian=True), along)
 

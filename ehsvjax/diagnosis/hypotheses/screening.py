@@ -17,10 +17,9 @@ from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT, corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.refits import Refits, unexplained
 from ehsvjax.diagnosis.bench.workbench import Workbench
-from ehsvjax.diagnosis.hypotheses.harmonics import with_frequencies
+from ehsvjax.diagnosis.hypotheses.harmonics import Waves, with_frequencies
 from ehsvjax.effects.effect import UNLIMITED, Candidate
 
 # Share of a response that must be left after the refit of the unknowns: below is rounding.
@@ -97,7 +96,7 @@ class Responses(NamedTuple):
 
 
 def responses_at(
-    bench: Workbench, current: Refits, excluded: Collection[int], noise: Noise, parts: Mapping[str, Parts]
+    bench: Workbench, current: Refits, excluded: Collection[int], noise: Noise, waves: Mapping[str, Waves]
 ) -> Responses:
     """Simulate the trials of every candidate but the excluded ones from the point of a refit.
 
@@ -106,10 +105,10 @@ def responses_at(
         current: one refit.
         excluded: positions of candidates that it includes already.
         noise: of the noise in which frequencies are looked for.
-        parts: the responses to parts of a disturbance, by signal, for the same.
+        waves: of harmonic effects, by the candidate's name, for the same.
 
     """
-    bench = with_frequencies(bench, current, noise, parts)
+    bench = with_frequencies(bench, current, noise, waves)
     point = current.points[0]
     trials = [
         trial for i, c in enumerate(bench.candidates) if i not in excluded for trial in _trials(bench, i, c, point)
