@@ -124,8 +124,10 @@ class Noise(NamedTuple):
         """Return the variance of what an explanation leaves, along a direction, and of how many parts it is known.
 
         That of the noise, which is known, or, if it is more and not by chance, as it differs from part to part of the
-        records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Both
-        arguments are of scaled readings.
+        records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Misfit
+        lasts: parts that are like their neighbours count as a first-order autoregression's do (Andrews & Monahan 1992,
+        "An improved heteroskedasticity and autocorrelation consistent covariance matrix estimator"), so that the
+        answer is no other with shorter parts. Both arguments are of scaled readings.
         """
         from scipy.special import chdtrc
 
@@ -133,9 +135,12 @@ class Noise(NamedTuple):
         part_of, squares = self._part_of, float(direction @ direction)
         shares = np.bincount(part_of, direction**2) / squares
         parts = 1.0 / float(shares @ shares)
-        between = float(np.sum(np.bincount(part_of, direction * left) ** 2)) / squares
+        sums = np.bincount(part_of, direction * left, minlength=_PARTS * len(self.measured)).reshape(-1, _PARTS)
+        between = float(np.sum(sums**2)) / squares
         if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
-            return between, parts
+            alike = max(0.0, float(np.sum(sums[:, 1:] * sums[:, :-1])) / float(np.sum(sums**2)))
+            as_one = min((1.0 + alike) / (1.0 - alike), parts)
+            return between * as_one, parts / as_one
         return of_noise, np.inf
 
     def of_record(self, record: int) -> "Noise":
