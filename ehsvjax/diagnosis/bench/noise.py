@@ -140,7 +140,7 @@ class Noise(NamedTuple):
         if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
             alike = max(0.0, float(np.sum(sums[:, 1:] * sums[:, :-1])) / float(np.sum(sums**2)))
             as_one = min((1.0 + alike) / (1.0 - alike), parts)
-            return between * as_one, parts / as_one
+            return between * as_one, parts
         return of_noise, np.inf
 
     def of_record(self, record: int) -> "Noise":

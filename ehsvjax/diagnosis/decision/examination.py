@@ -142,7 +142,7 @@ def _must_be_better_by(selection: Selection, innocent: bool) -> float:
 def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
     """Return a term of free form that explains the record as well as all causes together, and whether better.
 
-    It is not better if unused data are predicted better without it, with the causes: what follows any data that it is
+    It is not better if the causes predict the unused data of any record better: what follows any data that it is
     refitted to must at least predict.
     """
     causes = selection.included
@@ -156,8 +156,11 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
         return (term if better > -INSEPARABLE else None), False
     with_it = nominal._replace(residual=term.residual[None])
     unused = predicted(bench, [()], [with_it], noise, lambda known: told_by(bench, nominal, known, curve))
-    contradicted = unused.noise.gained(unused.residual[0], selection.unused.residual[0])
-    return term, bool(contradicted < INSEPARABLE)
+    contradicted = [
+        unused.noise.of_record(k).gained(unused.residual[0], selection.unused.residual[0])
+        for k in range(len(bench.records))
+    ]
+    return term, max(contradicted) < INSEPARABLE
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:

@@ -136,22 +136,27 @@ def select(bench: Workbench, progress: Progress) -> Selection:
     trials = trials_of(bench, progress)
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
     stages = [_look(trials, (), refit_set(trials, bench.nominal, (), plain), plain)]
-    while len(stages[-1].included) < _MOST_EFFECTS:
-        found = _next_effect(stages[-1])
-        if found is None:
-            break
+    while (found := _next_effect(stages[-1])) is not None:
         stages.append(found)
     progress("refitting the rivals", 0.5)
     last = stages.pop()
     nominal = stages[0].current if stages else last.current
-    weighed = _weighed(last, nominal)
-    while weighed.needless is not None:
-        # What was added first can become needless by what was added later.
+    weighed, looked_beside = _weighed(last, nominal), {frozenset(last.included)}
+    while True:
         last = weighed.stage
-        rest = tuple(j for j in last.included if j != weighed.needless)
-        refitted = refit_set(last.trials, last.current.points[0], rest, last.noise)
-        weighed = _weighed(_look(last.trials, rest, refitted, last.noise), nominal)
-    last = weighed.stage
+        if weighed.needless is not None:
+            # What was added first can become needless by what was added later.
+            rest = tuple(j for j in last.included if j != weighed.needless)
+            refitted = refit_set(last.trials, last.current.points[0], rest, last.noise)
+            found = _look(last.trials, rest, refitted, last.noise)
+        elif frozenset(last.included) not in looked_beside and len(looked_beside) < _ROUNDS:
+            # Beside what was swapped in, or without what was needless, something else may explain the rest.
+            looked_beside.add(frozenset(last.included))
+            found = _next_effect(last)
+        else:
+            break
+        if found is not None:
+            weighed = _weighed(found, nominal)
     return Selection(
         trials=last.trials,
         included=last.included,
@@ -288,7 +293,9 @@ def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: No
 
 
 def _next_effect(stage: Stage) -> Stage | None:
-    """Return the next look, with one effect more, or none if no effect is significant."""
+    """Return the next look, with one effect more, or none if no effect is significant or there are enough."""
+    if len(stage.included) == _MOST_EFFECTS:
+        return None
     trials = stage.trials
     bench = trials.bench
     hopeful = [
