@@ -127,7 +127,7 @@ class Noise(NamedTuple):
         records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Misfit
         lasts: parts that are like their neighbours count as a first-order autoregression's do (Andrews & Monahan 1992,
         "An improved heteroskedasticity and autocorrelation consistent covariance matrix estimator"), so that the
-        answer is no other with shorter parts. Both arguments are of scaled readings.
+        variance is no other with shorter parts. Both arguments are of scaled readings.
         """
         from scipy.special import chdtrc
 

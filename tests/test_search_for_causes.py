@@ -1,0 +1,82 @@
+"""The order of the search for causes: what is looked for beside what, with sets of names in the place of refits."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from ehsvjax.diagnosis.decision import search
+
+
+def stage_of(included):
+    refitted = SimpleNamespace(points=[None])
+    return SimpleNamespace(trials=SimpleNamespace(bench=None), included=included, current=refitted, noise=None)
+
+
+@pytest.fixture
+def searched(monkeypatch, unchecked):
+    """Search where `adds` says what explains most beside a set, `weighs` what becomes of it and what is needless."""
+
+    def search_with(adds, weighs):
+        looked = []
+
+        def next_effect(stage):
+            looked.append(frozenset(stage.included))
+            more = adds.get(frozenset(stage.included))
+            return None if more is None else stage_of((*stage.included, more))
+
+        def weighed(stage, nominal):
+            included, needless = weighs.get(frozenset(stage.included), (stage.included, None))
+            rest = {"nominal": None, "rivals": (), "needs": (), "unused": None, "worth": 0.0}
+            return SimpleNamespace(stage=stage_of(tuple(included)), needless=needless, **rest)
+
+        for name, stub in {
+            "prepared": lambda bench: bench,
+            "trials_of": lambda bench, progress: SimpleNamespace(bench=bench),
+            "plain_noise": lambda variance, measured: None,
+            "refit_set": lambda trials, start, included, noise: included,
+            "_look": lambda trials, included, current, noise: stage_of(included),
+            "_next_effect": next_effect,
+            "_weighed": weighed,
+            "_integration": lambda begun, ended, worth: None,
+        }.items():
+            monkeypatch.setattr(search, name, stub)
+        samples = SimpleNamespace(measured=None)
+        bench = SimpleNamespace(nominal=None, problem=SimpleNamespace(noise_variance=None, samples=samples))
+        return set(search.select(bench, lambda stage, done: None).included), looked
+
+    return search_with
+
+
+def sets(**named):
+    return {frozenset(name.split("_")) if name != "nothing" else frozenset(): value for name, value in named.items()}
+
+
+def test_beside_what_was_swapped_in_the_rest_is_looked_for(searched):
+    """Friction stood for a dead zone: beside it nothing gained enough, beside the dead zone the flow gain does."""
+    found, _ = searched(
+        sets(nothing="area", area="friction", area_dead="gain"), sets(area_friction=(("area", "dead"), None))
+    )
+    assert found == {"area", "dead", "gain"}
+
+
+def test_what_is_needless_beside_a_later_cause_is_not_looked_for_again(searched):
+    found, looked = searched(
+        sets(nothing="area", area="friction", area_dead="gain"),
+        sets(area_friction=(("area", "dead"), None), area_dead_gain=(("area", "dead", "gain"), "gain")),
+    )
+    assert found == {"area", "dead"}
+    assert looked.count(frozenset({"area", "dead"})) == 1
+
+
+def test_where_nothing_is_swapped_nothing_is_looked_for_twice(searched):
+    found, looked = searched(sets(nothing="area", area="dead"), {})
+    assert found == {"area", "dead"}
+    assert len(looked) == len(set(looked))
+
+
+def test_a_search_that_goes_round_ends(searched):
+    """Each cause is swapped for the other, and beside each something needless turns up."""
+    swaps = {frozenset({f"a{k}"}): ((f"a{k + 1}",), None) for k in range(50)}
+    found, _ = searched({frozenset(): "a0", **{frozenset({f"a{k}"}): "b" for k in range(1, 50)}}, swaps | {
+        frozenset({f"a{k}", "b"}): ((f"a{k + 1}", "b"), "b") for k in range(1, 50)})  # fmt: skip
+    assert len(found) == 1
