@@ -59,7 +59,7 @@ def test_the_step_and_what_it_is_worth_is_measured(diagnosis):
 def test_the_print_says_the_step_and_the_readings_that_are_left_out(diagnosis):
     step, left_out, _ = diagnosis.integration
     text = str(diagnosis)
-    assert f"simulated in steps of {1e3 * step:.3g} ms" in text
+    assert f"simulated in steps of {1e6 * step:.3g} µs" in text
     of_load_pressure = f"{left_out['load_pressure']} of load_pressure"
     assert f"readings that it cannot know, as beside a jump, carry no weight: {of_load_pressure}" in text
 
