@@ -76,7 +76,9 @@ def rivals_again(
         rest = tuple(j for j in included if j != own)
         # Beside what has been swapped in for another cause, some have too many numbers.
         able = [r for r in group if r.candidate != own and fits(trials.bench, (*rest, r.candidate))]
-        starts, others = [[r.refitted.points[0]] for r in able], [r.candidate for r in able]
+        # From where each was, and beside what all else has come to: along a flat valley the best has gone on.
+        starts = [[r.refitted.points[0], _in_place(trials.bench, final, r)] for r in able]
+        others = [r.candidate for r in able]
         led = refit_sets(trials, starts, [(*rest, i) for i in others], noise, race=True) if others else None
         found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
         ranked.append(_ranked(trials, own, rest, {own: final} | found, noise))
@@ -87,6 +89,13 @@ def rivals_again(
     return included, final, tuple(ranked)
 
 
+def _in_place(bench: Workbench, final: Refits, rival: Rival) -> Float[np.ndarray, " parameter"]:
+    """Return the point of a refit with the numbers of a rival."""
+    point, own = final.points[0].copy(), bench.columns_of(bench.candidates[rival.candidate])
+    point[own] = rival.refitted.points[0][own]
+    return point
+
+
 def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, noise: Noise) -> tuple[Rival, ...]:
     """Return what was refitted in the place of one effect, the best first."""
     bench = trials.bench
@@ -95,7 +104,24 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, n
     base = _beside(trials, start, current, noise) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
     found = _refitted_from(trials, base, own, rest, noise, start)
-    return _ranked(trials, own, rest, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
+    group = _ranked(trials, own, rest, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
+    return _beside_the_best(trials, own, rest, group, noise)
+
+
+def _beside_the_best(
+    trials: Trials, own: int, rest: tuple[int, ...], group: tuple[Rival, ...], noise: Noise
+) -> tuple[Rival, ...]:
+    """Return rivals that are not far behind refitted from where all else is as it is with the best, too.
+
+    Two that do the same are else told apart by the local minimum of the model's own unknowns that each has come to.
+    """
+    best, *others = (r for r in group if r.deficit < _WORTH_A_REFIT)
+    if not others:
+        return group
+    starts = [[_in_place(trials.bench, best.refitted, r)] for r in others]
+    led = refit_sets(trials, starts, [(*rest, r.candidate) for r in others], noise, race=True)
+    found = {r.candidate: r.refitted for r in group} | {r.candidate: led.of([k]) for k, r in enumerate(others)}
+    return _ranked(trials, own, rest, found, noise)
 
 
 def _ranked(

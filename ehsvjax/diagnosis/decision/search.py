@@ -139,9 +139,10 @@ def select(bench: Workbench, progress: Progress) -> Selection:
     while (found := _next_effect(stages[-1])) is not None:
         stages.append(found)
     progress("refitting the rivals", 0.5)
+    looked_beside = {frozenset(stage.included) for stage in stages}
     last = stages.pop()
     nominal = stages[0].current if stages else last.current
-    weighed, looked_beside = _weighed(last, nominal), {frozenset(last.included)}
+    weighed = _weighed(last, nominal)
     while True:
         last = weighed.stage
         if weighed.needless is not None:
@@ -149,7 +150,7 @@ def select(bench: Workbench, progress: Progress) -> Selection:
             rest = tuple(j for j in last.included if j != weighed.needless)
             refitted = refit_set(last.trials, last.current.points[0], rest, last.noise)
             found = _look(last.trials, rest, refitted, last.noise)
-        elif frozenset(last.included) not in looked_beside and len(looked_beside) < _ROUNDS:
+        elif frozenset(last.included) not in looked_beside and len(looked_beside) <= len(stages) + _ROUNDS:
             # Beside what was swapped in, or without what was needless, something else may explain the rest.
             looked_beside.add(frozenset(last.included))
             found = _next_effect(last)
