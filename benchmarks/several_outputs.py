@@ -128,9 +128,9 @@ def made(trials: list[Trial]) -> list[dict[str, np.ndarray]]:
     return found
 
 
-def _steady(output: np.ndarray) -> np.ndarray:
+def steady(output: np.ndarray, jump: float = JUMP) -> np.ndarray:
     """Return which readings of an output, in deviations of its noise, are less than a jump from both neighbours."""
-    near = np.abs(np.diff(output)) < JUMP
+    near = np.abs(np.diff(output)) < jump
     return np.append(True, near) & np.append(near, True)
 
 
@@ -145,12 +145,12 @@ def worth(trial: Trial, clean: dict[str, np.ndarray]) -> float:
     # In proportion where the supply or the area is absorbed by the flow gain.
     ratio = {"supply_pressure": trial.factor**0.5, "piston_area": 1.0 / trial.factor}.get(trial.name, 1.0)
     start[2] *= ratio
-    steady = {name: _steady(clean[name] / NOISE[name]) for name in trial.outputs}
+    readable = {name: steady(clean[name] / NOISE[name]) for name in trial.outputs}
 
     def left(logarithms):
         values = dict(zip(names, start * np.exp(logarithms), strict=True))
         motion = servovalve_plant(command, PERIOD, rtol=1e-8, **values, **given(trial))
-        return np.concatenate([(getattr(motion, n) - clean[n])[steady[n]] / NOISE[n] for n in trial.outputs])
+        return np.concatenate([(getattr(motion, n) - clean[n])[readable[n]] / NOISE[n] for n in trial.outputs])
 
     def slopes(logarithms):
         step = 1e-4

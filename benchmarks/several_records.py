@@ -28,6 +28,7 @@ from scipy.optimize import least_squares
 import ehsvjax
 from benchmarks.diagnosis import base, counts
 from benchmarks.processes import rows_of, said
+from benchmarks.several_outputs import FINE_STEP, steady
 from ehsvjax.diagnosis import Diagnosis, diagnose
 from tests.hidden_oracle import EXACTLY_ALIKE, SEPARABLE, variants_of
 from tests.hidden_plants import SERVOVALVE_EFFECTS, SERVOVALVE_STEP, Valve, held_levels, servovalve_with
@@ -36,9 +37,8 @@ from tests.hidden_records import ONE_SIDED, TRUTH, Hidden, sizes_of
 MODEL, PERIOD = "servovalve", 1e-3
 NOISE = {"position": 1e-4, "load_pressure": 5e4}
 CONDITIONS = ("half the supply", "less amplitude", "load pressure too")
-# Steps of the plant in which a load pressure is known to a few readings, s; deviations of its noise between two
-# readings that are a jump, beside which the plant's own last bit would decide.
-FINE_STEP, JUMP = 1e-5, 30.0
+# Deviations of the noise between two readings that are a jump: a position may move by ten from sample to sample.
+JUMP = 30.0
 # What may change between two records, and by how much, in shares of it; the zero in m.
 CHANGES = {
     "flow_gain": (0.03, 0.3), "feedback_gain": (0.03, 0.3), "dead_zone": (0.1, 0.8), "damping_ratio": (0.1, 0.5),
@@ -176,12 +176,11 @@ class Library(NamedTuple):
 def library(condition: str) -> Library:
     """Return what plants do in both records of one condition."""
     y = readings_of(condition, np.concatenate([PLAIN[None], PLAIN + np.diag(STEPS)]), [{}] * (1 + len(PLAIN)))
-    near = np.abs(np.diff(y[0])) < JUMP
-    steady = np.append(True, near) & np.append(near, True)
-    basis = np.linalg.qr(((y[1:] - y[0]) * steady).T)[0]
+    kept = steady(y[0], JUMP)
+    basis = np.linalg.qr(((y[1:] - y[0]) * kept).T)[0]
     variants = variants_of(MODEL, PERIOD * len(strokes(condition)[0].command))
     effects = [{name: sizes} for name, some in variants.items() for sizes in some]
-    bare = Library(y[0], steady, basis, effects, np.zeros((0, len(y[0]))))
+    bare = Library(y[0], kept, basis, effects, np.zeros((0, len(y[0]))))
     left = bare.beside(readings_of(condition, np.tile(PLAIN, (len(effects), 1)), effects))
     return bare._replace(directions=left / np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-300))
 
@@ -211,7 +210,7 @@ def deficit_of(trial: Trial, clean: Sequence[np.ndarray]) -> tuple[float, str]:
 def _refitted(condition: str, both: np.ndarray, effect: Mapping) -> float:
     """Return the noise variances that a rival leaves of both records, refitted in the plant with all parameters."""
     ((name, sizes),) = effect.items()
-    steady, numbers = library(condition).steady, np.array([*sizes.values()])
+    kept, numbers = library(condition).steady, np.array([*sizes.values()])
     start = np.concatenate([PLAIN, numbers])
     steps = np.concatenate([STEPS, 1e-4 * np.abs(numbers)])
     lowest = np.full(len(start), -np.inf)
@@ -223,11 +222,11 @@ def _refitted(condition: str, both: np.ndarray, effect: Mapping) -> float:
         return readings_of(condition, points[:, : len(PLAIN)], some)
 
     def left(point):
-        return (both - simulated(point[None])[0]) * steady
+        return (both - simulated(point[None])[0]) * kept
 
     def slopes(point):
         y = simulated(np.concatenate([point[None], point + np.diag(steps)]))
-        return -((y[1:] - y[0]) * steady / steps[:, None]).T
+        return -((y[1:] - y[0]) * kept / steps[:, None]).T
 
     with np.errstate(over="ignore", invalid="ignore"):
         found = least_squares(left, start, slopes, bounds=(lowest, np.inf), x_scale="jac", ftol=1e-4, max_nfev=20)
