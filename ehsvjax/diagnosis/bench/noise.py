@@ -26,6 +26,8 @@ _NEGLIGIBLE = 1e-3
 _ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
 # Of a record, between which an explanation's gain may differ.
 _PARTS = 20
+# Standard errors of the correlation of neighbouring parts that chance seldom exceeds (one-sided, 10%).
+_LASTS = 1.28
 
 
 class Noise(NamedTuple):
@@ -125,9 +127,9 @@ class Noise(NamedTuple):
 
         That of the noise, which is known, or, if it is more and not by chance, as it differs from part to part of the
         records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Misfit
-        lasts: parts that are like their neighbours count as a first-order autoregression's do (Andrews & Monahan 1992,
-        "An improved heteroskedasticity and autocorrelation consistent covariance matrix estimator"), so that the
-        variance is no other with shorter parts. Both arguments are of scaled readings.
+        lasts: parts that are like their neighbours, and not by chance, count as a first-order autoregression's do
+        (Andrews & Monahan 1992, "An improved heteroskedasticity and autocorrelation consistent covariance matrix
+        estimator"), so that the variance is no other with shorter parts. Both arguments are of scaled readings.
         """
         from scipy.special import chdtrc
 
@@ -138,9 +140,9 @@ class Noise(NamedTuple):
         sums = np.bincount(part_of, direction * left, minlength=_PARTS * len(self.measured)).reshape(-1, _PARTS)
         between = float(np.sum(sums**2)) / squares
         if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
-            alike = max(0.0, float(np.sum(sums[:, 1:] * sums[:, :-1])) / float(np.sum(sums**2)))
-            as_one = min((1.0 + alike) / (1.0 - alike), parts)
-            return between * as_one, parts
+            alike = float(np.sum(sums[:, 1:] * sums[:, :-1])) / float(np.sum(sums**2))
+            lasts = alike * np.sqrt(parts) > _LASTS
+            return between * (min((1.0 + alike) / (1.0 - alike), parts) if lasts else 1.0), parts
         return of_noise, np.inf
 
     def of_record(self, record: int) -> "Noise":

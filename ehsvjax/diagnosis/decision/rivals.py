@@ -76,11 +76,7 @@ def rivals_again(
         rest = tuple(j for j in included if j != own)
         # Beside what has been swapped in for another cause, some have too many numbers.
         able = [r for r in group if r.candidate != own and fits(trials.bench, (*rest, r.candidate))]
-        # From where each was, and beside what all else has come to: along a flat valley the best has gone on.
-        starts = [[r.refitted.points[0], _in_place(trials.bench, final, r)] for r in able]
-        others = [r.candidate for r in able]
-        led = refit_sets(trials, starts, [(*rest, i) for i in others], noise, race=True) if others else None
-        found = {i: led.of([k]) for k, i in enumerate(others) if led is not None}
+        found = _refitted_beside(trials, final, able, rest, noise)
         ranked.append(_ranked(trials, own, rest, {own: final} | found, noise))
     for own, group in zip(included, ranked, strict=True):
         if group[0].candidate != own:
@@ -89,11 +85,23 @@ def rivals_again(
     return included, final, tuple(ranked)
 
 
-def _in_place(bench: Workbench, final: Refits, rival: Rival) -> Float[np.ndarray, " parameter"]:
-    """Return the point of a refit with the numbers of a rival."""
-    point, own = final.points[0].copy(), bench.columns_of(bench.candidates[rival.candidate])
-    point[own] = rival.refitted.points[0][own]
-    return point
+def _refitted_beside(
+    trials: Trials, final: Refits, rivals: Sequence[Rival], rest: tuple[int, ...], noise: Noise
+) -> dict[int, Refits]:
+    """Return rivals refitted from where each was, and from where all else is as it is in another refit.
+
+    Two that do the same are else told apart by the local minimum of the model's own unknowns that each has come to, or
+    by how far the other has gone on along a flat valley.
+    """
+    if not rivals:
+        return {}
+    starts = []
+    for rival in rivals:
+        own, there = trials.bench.columns_of(trials.bench.candidates[rival.candidate]), final.points[0].copy()
+        there[own] = rival.refitted.points[0][own]
+        starts.append([rival.refitted.points[0], there])
+    led = refit_sets(trials, starts, [(*rest, r.candidate) for r in rivals], noise, race=True)
+    return {r.candidate: led.of([k]) for k, r in enumerate(rivals)}
 
 
 def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, noise: Noise) -> tuple[Rival, ...]:
@@ -105,23 +113,9 @@ def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, n
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
     found = _refitted_from(trials, base, own, rest, noise, start)
     group = _ranked(trials, own, rest, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
-    return _beside_the_best(trials, own, rest, group, noise)
-
-
-def _beside_the_best(
-    trials: Trials, own: int, rest: tuple[int, ...], group: tuple[Rival, ...], noise: Noise
-) -> tuple[Rival, ...]:
-    """Return rivals that are not far behind refitted from where all else is as it is with the best, too.
-
-    Two that do the same are else told apart by the local minimum of the model's own unknowns that each has come to.
-    """
     best, *others = (r for r in group if r.deficit < _WORTH_A_REFIT)
-    if not others:
-        return group
-    starts = [[_in_place(trials.bench, best.refitted, r)] for r in others]
-    led = refit_sets(trials, starts, [(*rest, r.candidate) for r in others], noise, race=True)
-    found = {r.candidate: r.refitted for r in group} | {r.candidate: led.of([k]) for k, r in enumerate(others)}
-    return _ranked(trials, own, rest, found, noise)
+    again = _refitted_beside(trials, best.refitted, others, rest, noise)
+    return _ranked(trials, own, rest, {r.candidate: r.refitted for r in group} | again, noise) if again else group
 
 
 def _ranked(
