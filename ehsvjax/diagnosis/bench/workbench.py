@@ -144,7 +144,9 @@ class Workbench:
 
     def value(self, point: Float[np.ndarray, " parameter"], column: int) -> float:
         """Value of one unknown at a point, SI."""
-        return to_values(self._coordinates_of(column), point[[column]]).item()
+        # Of what leaves no trace, any amount: it may be infinite.
+        with np.errstate(over="ignore"):
+            return to_values(self._coordinates_of(column), point[[column]]).item()
 
     def coordinate(self, value: float, column: int) -> float:
         """Coordinate of one unknown that has this value, SI."""

@@ -269,7 +269,8 @@ def _settled(bench: Workbench, final: Refits, noise: Noise, curve: Curve, point,
             points.append(moved)
             curves.append(coefficients + of_pieces)
         residuals = noise.scaled(measured - outputs_with(bench, np.stack(points), np.stack(curves), curve))
-        costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
+        with np.errstate(over="ignore"):  # a step too far may lead anywhere
+            costs = np.nan_to_num(np.sum(residuals**2, axis=1), nan=np.inf)
         # The most damped of those as good: what the record hardly tells is not to wander.
         best = int(np.flatnonzero(costs <= np.min(costs) + _SETTLED)[-1])
         gain = left - costs[best]
