@@ -5,13 +5,17 @@ BIN = $(VENV)/bin
 # What the tests and the notebooks have compiled need not be compiled again.
 CACHED = JAX_COMPILATION_CACHE_DIR=$(CURDIR)/.jax_cache JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS=0
 
-.PHONY: demo test lint types notebooks docs benchmarks clean
+.PHONY: demo test thorough lint types notebooks docs benchmarks clean
 
 demo: $(VENV)/installed
 	$(BIN)/python -m ehsvjax --out out
 
 test: $(VENV)/installed-test
 	$(BIN)/python -m pytest -n auto --dist loadgroup
+
+# With those that take minutes, as every night.
+thorough: $(VENV)/installed-test
+	$(BIN)/python -m pytest -n auto --dist loadgroup -m ""
 
 lint: $(VENV)/installed-develop
 	$(BIN)/ruff check .

@@ -36,7 +36,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).resolve().parents[1] / ".jax_cache"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 chosen = [a for a in sys.argv[1:] if not a.startswith("-")] or ["*.ipynb"]
-paths = sorted({p for pattern in chosen for p in Path(__file__).parent.glob(pattern)})
+# The last one takes longest.
+paths = sorted({p for pattern in chosen for p in Path(__file__).parent.glob(pattern)}, reverse=True)
 with ThreadPoolExecutor(2) as pool:
     # Taking the results raises what a notebook has raised.
     list(pool.map(run, paths))

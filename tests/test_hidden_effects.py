@@ -1,7 +1,7 @@
 """An independent plant hides an effect in a record; the package gets the record alone and must find it.
 
-By default some of the effects of each model are hidden in turn, and one that is drawn afresh; all of them with
-EHSVJAX_SWEEP=1 (some ten minutes), as benchmarks/diagnosis.py does at three noise levels.
+Some of the effects of each model are hidden in turn, and one that is drawn afresh; all of them if tests are thorough,
+as benchmarks/diagnosis.py does at three noise levels.
 """
 
 import os
@@ -19,7 +19,6 @@ from tests.hidden_records import Hidden, records
 
 # A fresh seed each time; set the variable to repeat a run.
 FRESH = int(os.environ.get("EHSVJAX_SEED", secrets.randbelow(2**31)))
-EVERY = 1 if os.environ.get("EHSVJAX_SWEEP") else 8
 # Low noise, so that nearly every plausible size shows in a short record.
 VARIANCE = {"servovalve": 1e-10, "van_der_pol": 1e-4}
 SAMPLES = {"servovalve": 2000, "van_der_pol": 1500}
@@ -31,6 +30,11 @@ PLAIN = 100.0
 def known(model: str) -> list[str]:
     # Quantisation is noise until it is coarser than the noise; it has a test of its own.
     return [n for n in effect_sizes(model) if not n.startswith("unknown") and n != "sensor_quantisation"]
+
+
+def some_first(model: str) -> list:
+    """Return all effects, of which all but every eighth are for thorough tests."""
+    return [pytest.param(n, marks=[pytest.mark.thorough] if i % 8 else []) for i, n in enumerate(known(model))]
 
 
 def diagnosed(hidden: Hidden) -> tuple[Diagnosis, float, str]:
@@ -72,18 +76,24 @@ OF = {"van_der_pol": of_the_oscillator, "servovalve": of_the_servovalve}
 
 
 @of_the_oscillator
-@pytest.mark.parametrize("name", known("van_der_pol")[::EVERY])
+@pytest.mark.parametrize("name", some_first("van_der_pol"))
 def test_an_effect_of_the_oscillator_is_found(name):
     check_found(Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], (name,), 1))
 
 
 @of_the_servovalve
-@pytest.mark.parametrize("name", known("servovalve")[::EVERY])
+@pytest.mark.parametrize("name", some_first("servovalve"))
 def test_an_effect_of_the_servovalve_is_found(name):
     check_found(Hidden("servovalve", "white", VARIANCE["servovalve"], (name,), 1))
 
 
-@pytest.mark.parametrize("model", [pytest.param(m, marks=OF[m]) for m in (["van_der_pol"] if EVERY > 1 else MODELS)])
+@pytest.mark.parametrize(
+    "model",
+    [
+        pytest.param("van_der_pol", marks=of_the_oscillator),
+        pytest.param("servovalve", marks=[of_the_servovalve, pytest.mark.thorough]),
+    ],
+)
 def test_an_effect_drawn_afresh_is_found(model):
     name = known(model)[FRESH % len(known(model))]
     check_found(Hidden(model, "white", VARIANCE[model], (name,), FRESH))
@@ -121,7 +131,7 @@ def test_two_effects_together_are_both_found(model, pair):
 
 
 @of_the_oscillator
-@pytest.mark.parametrize("seed", [6, 7])
+@pytest.mark.parametrize("seed", [6, pytest.param(7, marks=pytest.mark.thorough)])
 def test_what_makes_the_same_record_stays_one_group_beside_a_harmonic_force(seed):
     # A frequency that was refitted without the constant force goes far to make up for it.
     hidden = Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], ("harmonic_force", "constant_force"), seed)
@@ -130,6 +140,7 @@ def test_what_makes_the_same_record_stays_one_group_beside_a_harmonic_force(seed
     assert held(found) == {"harmonic_force", "constant_force", "input_bias"}, said
 
 
+@pytest.mark.thorough
 @of_the_oscillator
 def test_what_makes_the_same_record_stays_one_group_beside_an_effect_that_turns_the_phase():
     # With the stiffness out, parameters that stay where they are lose the phase: refits from there go nowhere.

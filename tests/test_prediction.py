@@ -129,6 +129,7 @@ def test_a_delay_that_is_known_too_little_to_predict_by_is_in_the_answer():
     assert "transport_delay" in {*found.names, *(name for a in found.alternatives for name in a.causes)}, str(found)
 
 
+@pytest.mark.thorough
 def test_what_the_search_takes_for_significant_earns_its_place():
     """A bias of 4.3 standard deviations, p = 0.0011 of the whole search, was "unexplained"."""
     (made,) = records([Hidden("servovalve", "white", 1e-5, ("asymmetric_dead_zone",), 75656314)])
@@ -139,6 +140,7 @@ def test_what_the_search_takes_for_significant_earns_its_place():
     assert "asymmetric_dead_zone" in {*found.names, *(name for a in found.alternatives for name in a.causes)}
 
 
+@pytest.mark.thorough
 def test_a_straight_line_is_no_better_reason_than_two_effects_that_make_it():
     """A bias and a compliance: one straight line along the load pressure, of 2.00002 pieces, was said to be better."""
     pair = ("asymmetric_dead_zone", "structural_flexibility")

@@ -9,12 +9,11 @@ from benchmarks.real_records import AT_HAND, RIGS, judged
 pytestmark = pytest.mark.skipif(not AT_HAND, reason="the measured records are not at hand")
 
 
-def diagnosed(name, share=1.0):
-    """Return the rig and the diagnosis of its records, or of the first share of each."""
+def diagnosed(name):
+    """Return the rig and the diagnosis of its records."""
     rig = RIGS[name]()
-    records = [record.split(fraction=share)[0] if share < 1.0 else record for record in rig.records]
-    fit = ehsvjax.identify(rig.model, records, key=jax.random.key(0), population=40, generations=10)
-    return rig, ehsvjax.diagnose(fit, records, key=jax.random.key(1))
+    fit = ehsvjax.identify(rig.model, list(rig.records), key=jax.random.key(0), population=40, generations=10)
+    return rig, ehsvjax.diagnose(fit, list(rig.records), key=jax.random.key(1))
 
 
 def test_a_lag_or_hysteresis_of_two_sweeps_is_found_and_predicts_each_from_the_other():
@@ -32,9 +31,9 @@ def test_a_tank_that_overflows_is_found_and_another_record_predicted():
     assert found.extended.score(other).rmse["level"] < 0.45 < found.fit.score(other).rmse["level"]
 
 
+@pytest.mark.thorough
 def test_dry_friction_comes_before_the_gap_and_another_amplitude_is_predicted():
-    """The whole of it is in benchmarks/real_records.py, a minute and more."""
-    rig, found = diagnosed("damper", 0.5)
+    rig, found = diagnosed("damper")
     assert judged(rig, found).startswith("right"), str(found)
     assert found.names[0] == "coulomb_friction"
     assert any("dead_zone" in names for names in (found.names, *(a.causes for a in found.alternatives)))
@@ -42,6 +41,7 @@ def test_dry_friction_comes_before_the_gap_and_another_amplitude_is_predicted():
     assert found.extended.score(other).fit_percent["force"] > 84.0
 
 
+@pytest.mark.thorough
 def test_slow_misfit_is_not_taken_for_noise():
     """Of the tanks' other record alone, what is left is ten times the noise that is seen elsewhere."""
     rig = RIGS["tanks"]()
@@ -60,14 +60,12 @@ def test_what_was_of_one_sweep_is_not_predicted_of_the_other():
     assert found.extended.score(other).rmse["flow"] < fit.score(other).rmse["flow"], str(found)
 
 
+@pytest.mark.thorough
 def test_a_constant_force_beside_slow_misfit_is_not_taken_for_its_drift():
-    """Of a part of the drive's record what is left is all but a random walk, in which a constant is nothing.
-
-    Every other sample of it tells as much in half the time.
-    """
+    """Of a part of the drive's record what is left is all but a random walk, in which a constant is nothing."""
     rig = RIGS["drive"]()
     (train,) = rig.records
-    record, _ = train.resample(2.0 * train.sample_period).split(fraction=0.6)
+    record, _ = train.split(fraction=0.6)
     fit = ehsvjax.identify(rig.model, record, key=jax.random.key(0), population=40, generations=10)
     found = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
     assert {"coulomb_friction", "constant_force"} <= {*found.names}, str(found)

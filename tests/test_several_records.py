@@ -153,6 +153,7 @@ def test_a_record_may_hold_outputs_that_another_does_not(held):
             assert output.noise_floor == pytest.approx(noise[name], rel=0.15)
 
 
+@pytest.mark.thorough
 @of_the_servovalve
 def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_settles(tmp_path):
     load = {"constant_load": {"force": 800.0}}
@@ -174,6 +175,7 @@ def test_what_one_record_cannot_tell_the_experiment_that_is_planned_from_it_sett
     assert together.extended.parameters["constant_load.force"] == pytest.approx(800.0, rel=0.1)
 
 
+@pytest.mark.thorough
 @of_the_servovalve
 def test_what_each_record_alone_leaves_open_is_no_evidence_against_a_cause():
     """Friction is a smaller flow gain at one supply pressure: no record predicts the other, and both fix its size."""

@@ -101,6 +101,7 @@ def test_effects_that_are_absent_are_skipped_and_those_that_act_are_not(bench):
     differ_by_rounding_alone(bench)
 
 
+@pytest.mark.thorough
 def test_at_a_servovalve_too_effects_are_skipped_only_where_they_are_absent():
     bench = workbench(*valve_fitted(max_step=2.5e-4), BANK)
     differ_by_rounding_alone(bench)
