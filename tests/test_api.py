@@ -74,7 +74,7 @@ import ehsvjax
 heavy = ["pandas", "matplotlib.pyplot", "scipy.io", "scipy.signal", "scipy.stats", "jinja2", "tqdm", "IPython"]
 heavy = [m for m in heavy if m in sys.modules]
 from jax._src import xla_bridge
-print(json.dumps({"heavy": heavy, "changed": [k for k, v in jax.config.values.items() if before[k] != v],
+print(json.dumps({"heavy": heavy, "changed": [k for k, v in jax.config.values.items() if before.get(k, v) != v],
                   "backends": bool(xla_bridge._backends)}))
 """
 
