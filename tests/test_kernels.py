@@ -52,6 +52,7 @@ def _state_space(x, y):
     return jnp.sum(state), jnp.max(state), jnp.polyval(jnp.array([1.0, 2.0, 3.0]), x)
 
 
+of_the_kernels = pytest.mark.skipif(bool(kernels._PLAIN), reason="loops run as XLA compiles them by itself")
 EVERY_FUNCTION = pytest.mark.parametrize("function", [_shared, _branches, _tables, _solved, _state_space])
 WRAPPERS = {"one kernel": kernels.one_kernel, "stored once": kernels.stored_once,
             "both": lambda f: kernels.one_kernel(kernels.stored_once(f))}  # fmt: skip
@@ -112,6 +113,7 @@ def test_any_expression_graph_keeps_its_values(seed, operations):
     _assert_close(jax.jit(kernels.stored_once(function))(*arguments), function(*arguments))
 
 
+@of_the_kernels
 def test_what_several_results_need_is_computed_once():
     def function(x):
         root = jnp.sqrt(1.0 + x * x)
@@ -123,11 +125,13 @@ def test_what_several_results_need_is_computed_once():
     assert sum("sqrt" in call for call in calls) == 1
 
 
+@of_the_kernels
 def test_what_is_cheap_is_not_stored():
     traced = jax.make_jaxpr(kernels.stored_once(lambda x: (x + 1.0, (x + 1.0) * 2.0)))(jnp.float32(0.5))
     assert sum(equation.primitive.name == "jit" for equation in traced.eqns) == 2
 
 
+@of_the_kernels
 def test_loop_is_one_native_function():
     def simulate(angle):
         return lax.fori_loop(0, 1000, lambda _, state: _pendulum(state), (angle, 0.0 * angle))[0]
@@ -178,6 +182,7 @@ def test_elsewhere_than_on_the_cpu_everything_is_the_function_itself(monkeypatch
     assert "xla_metadata" not in str(jax.make_jaxpr(functools.partial(kernels.in_blocks, lambda r: r[:, 0]))(rows))
 
 
+@of_the_kernels
 def test_device_that_the_user_chose_is_heeded():
     assert kernels._shaped()
     with jax.default_device(jax.devices("cpu")[0]):
@@ -209,7 +214,7 @@ def test_without_the_kernels_all_is_the_same_but_slower():
         done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
         return done.stdout.split()
 
-    warned, cost = run()
+    warned, cost = run(EHSVJAX_PLAIN_KERNELS="")
     assert warned == "0"
     for plain in (run("lacking"), run(EHSVJAX_PLAIN_KERNELS="1")):
         assert plain[0] == "1"
