@@ -32,7 +32,7 @@ def known(model: str) -> list[str]:
     return [n for n in effect_sizes(model) if not n.startswith("unknown") and n != "sensor_quantisation"]
 
 
-def some_first(model: str) -> list:
+def every_one(model: str) -> list:
     """Return all effects, of which all but every eighth are for thorough tests."""
     return [pytest.param(n, marks=[pytest.mark.thorough] if i % 8 else []) for i, n in enumerate(known(model))]
 
@@ -76,13 +76,13 @@ OF = {"van_der_pol": of_the_oscillator, "servovalve": of_the_servovalve}
 
 
 @of_the_oscillator
-@pytest.mark.parametrize("name", some_first("van_der_pol"))
+@pytest.mark.parametrize("name", every_one("van_der_pol"))
 def test_an_effect_of_the_oscillator_is_found(name):
     check_found(Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], (name,), 1))
 
 
 @of_the_servovalve
-@pytest.mark.parametrize("name", some_first("servovalve"))
+@pytest.mark.parametrize("name", every_one("servovalve"))
 def test_an_effect_of_the_servovalve_is_found(name):
     check_found(Hidden("servovalve", "white", VARIANCE["servovalve"], (name,), 1))
 

@@ -138,12 +138,14 @@ class Noise(NamedTuple):
         shares = np.bincount(part_of, direction**2) / squares
         parts = 1.0 / float(shares @ shares)
         sums = np.bincount(part_of, direction * left, minlength=_PARTS * len(self.measured)).reshape(-1, _PARTS)
-        between = float(np.sum(sums**2)) / squares
-        if chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
-            alike = float(np.sum(sums[:, 1:] * sums[:, :-1])) / float(np.sum(sums**2))
-            lasts = alike * np.sqrt(parts) > _LASTS
-            return between * (min((1.0 + alike) / (1.0 - alike), parts) if lasts else 1.0), parts
-        return of_noise, np.inf
+        own = float(np.sum(sums**2))
+        between = own / squares
+        if not chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
+            return of_noise, np.inf
+        alike = float(np.sum(sums[:, 1:] * sums[:, :-1])) / own
+        if alike * np.sqrt(parts) > _LASTS:
+            between *= min((1.0 + alike) / (1.0 - alike), parts)
+        return between, parts
 
     def of_record(self, record: int) -> "Noise":
         """Return the noise with the readings of one record alone."""
