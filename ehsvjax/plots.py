@@ -558,10 +558,12 @@ def _draw_search(axes, fit: Fit) -> None:
     _legend(axes)
 
 
-def _legend(axes) -> None:
-    """Put the legend above the right end of the axes, where no data can lie."""
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3, borderaxespad=0.0, markerscale=3,
-                columnspacing=1.2, handlelength=1.6)  # fmt: skip
+def _legend(axes, *below) -> None:
+    """Put the legend of the axes, and of those below, above their right end, where no data can lie."""
+    entries = [entry for one in (axes, *below) for entry in zip(*one.get_legend_handles_labels(), strict=True)]
+    handles, labels = zip(*entries, strict=True)
+    axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3, borderaxespad=0.0,
+                markerscale=3, columnspacing=1.2, handlelength=1.6)  # fmt: skip
 
 
 def _share_time(axes, record: Record) -> None:

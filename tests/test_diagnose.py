@@ -14,6 +14,7 @@ from scipy.integrate import solve_ivp
 import ehsvjax
 from ehsvjax.diagnosis import Alternative
 from ehsvjax.effects import BANK, amplitude, attach, effects_of
+from ehsvjax.quantities import quantity
 from tests.compilations import compilations
 
 # One process compiles.
@@ -319,6 +320,8 @@ def test_the_page_needs_no_other_file_and_takes_no_name_for_markup(diagnosis, tm
     assert "bench &lt;script&gt;alert(1)&lt;/script&gt;" in page
     for cause in diagnosis.table["cause"]:
         assert f"<td>{cause}</td>" in page, cause
+    first = diagnosis.table.iloc[0]
+    assert f'<td class="number">{quantity(first["size"], first["unit"])}</td>' in page
     assert "<b>named</b>: sensor_bias" in page
     for tag in ("html", "head", "body", "table", "tr", "td", "ul", "li", "pre", "p"):
         assert len(re.findall(rf"<{tag}[ >]", page)) == page.count(f"</{tag}>"), tag
@@ -327,14 +330,15 @@ def test_the_page_needs_no_other_file_and_takes_no_name_for_markup(diagnosis, tm
 def test_every_axis_of_the_picture_says_what_it_shows(diagnosis):
     figure = diagnosis.plot()
     assert figure.get_suptitle().endswith(": named: sensor bias")
-    assert len(figure.axes) == 6
+    assert len(figure.axes) == 7
     assert "suspects" in [axes.get_title(loc="left") for axes in figure.axes]
     labels = [axes.get_xlabel() for axes in figure.axes]
     assert "time (s)" in labels and "frequency (Hz)" in labels and "score on the nominal model" in labels[-1]
-    series, spectrum, *profiles, suspects = figure.axes
+    series, series_after, spectrum, *profiles, suspects = figure.axes
+    assert series_after.get_xlabel() == "time (s)" and series_after.get_ylim() == series.get_ylim()
     assert series.get_ylabel() == "residual of\nposition (–)" and spectrum.get_ylabel() == "power (1/Hz)"
     assert profiles[0].get_ylabel() == "mean residual (–)"
-    assert all(re.search(r"\(.+\)", axes.get_xlabel()) for axes in figure.axes)
+    assert all(re.search(r"\(.+\)", axes.get_xlabel()) for axes in figure.axes if axes is not series)
     assert suspects.get_yticklabels()[-1].get_text() == "sensor bias"
     lengths = [bar.get_width() for bar in suspects.patches]
     assert lengths == sorted(lengths) and lengths[-1] > suspects.lines[0].get_xdata()[0] > 3.0

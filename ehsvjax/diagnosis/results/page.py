@@ -13,11 +13,13 @@ from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 from ehsvjax.diagnosis.results.pictures import plot_diagnosis
 from ehsvjax.files import written_whole
 from ehsvjax.plots import embedded, plot_fit, to_png
+from ehsvjax.quantities import quantity
 
 if TYPE_CHECKING:
     from ehsvjax.experiment import Plan
 
-_HEADS = ("cause", "signal", "size", "unit", "score", "p, whole search", "gain", "smallest to be found", "looks like")
+_HEADS = ("cause", "signal", "size", "score", "p, whole search", "gain", "smallest to be found", "looks like")
+_ABSENT = "–"
 
 
 def write_page(diagnosis: Diagnosis, path: str | os.PathLike, plan: "Plan | None") -> None:
@@ -48,6 +50,7 @@ def write_page(diagnosis: Diagnosis, path: str | os.PathLike, plan: "Plan | None
         following=words.next_lines(diagnosis),
         heads=_HEADS,
         rows=[_row(row) for row in diagnosis.table.itertuples()],
+        excluded=[(e.cause, _size(e.above, e.unit)) for e in diagnosis.excluded],
         tests=diagnosis.misfit.tests,
         tests_after=diagnosis.misfit.tests_after,
         extended=str(diagnosis.extended),
@@ -66,13 +69,15 @@ def _row(row) -> dict:
     return {
         "included": row.included,
         "cells": (
-            row.cause, row.signal, _number(row.size), row.unit, _number(row.score), _number(row.p_corrected),
-            _number(row.likelihood_gain), _number(row.smallest_detectable), row.confounded_with,
+            row.cause, row.signal, _size(row.size, row.unit), _number(row.score), _number(row.p_corrected),
+            _number(row.likelihood_gain), _size(row.smallest_detectable, row.unit), row.confounded_with,
         ),
     }  # fmt: skip
 
 
+def _size(value: float, unit: str) -> str:
+    return _ABSENT if not np.isfinite(value) else quantity(value, unit).replace("-", "−")
+
+
 def _number(value: float) -> str:
-    if not np.isfinite(value):
-        return "–"
-    return f"{value:.3g}".replace("-", "−")
+    return _ABSENT if not np.isfinite(value) else f"{value:.3g}".replace("-", "−")

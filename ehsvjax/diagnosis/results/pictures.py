@@ -65,7 +65,11 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
     unit = diagnosis.fit.model.unit(name)
     extended = diagnosis.extended.model.name != diagnosis.fit.model.name
     grid = part.add_gridspec(2, _PANELS, height_ratios=[1.0, 1.1])
-    series, spectrum = part.add_subplot(grid[0, :2]), part.add_subplot(grid[0, 2])
+    # One above the other: dots of the one would hide those of the other.
+    series = (
+        grid[0, :2].subgridspec(1 + extended, 1, hspace=0.0).subplots(sharex=True, sharey=True, squeeze=False)[:, 0]
+    )
+    spectrum = part.add_subplot(grid[0, 2])
     factor, label = _scaled(np.concatenate([m.residual for m in found]), unit)
     dots = {"ls": "none", "marker": ".", "ms": 2.0, "rasterized": True}
     begins = 0.0
@@ -76,14 +80,18 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
         of_model, of_extended, of_noise = (
             ("the model", "extended", "95% of the noise") if k == there[0] else (None, None, None)
         )
-        series.plot(time, m.residual / factor, color=_MEASURED, label=of_model, **dots)
+        series[0].plot(time, m.residual / factor, color=_MEASURED, label=of_model, **dots)
         if extended:
             after = np.where(np.isnan(m.residual), np.nan, diagnosis.extended.residuals(record)[name])
-            series.plot(time, after / factor, color=_MODEL, label=of_extended, **dots)
+            series[1].plot(time, after / factor, color=_MODEL, label=of_extended, **dots)
         reach, ends = 1.96 * m.noise_floor / factor, time[-1] + record.sample_period
-        series.fill_between([time[0], ends], -reach, reach, color=_COMMAND, alpha=0.12, lw=0, label=of_noise)
-        if k != there[0]:
-            series.axvline(begins, color=_AXIS, lw=0.8)
+        for axes in series:
+            axes.fill_between(
+                [time[0], ends], -reach, reach, color=_COMMAND, alpha=0.12, lw=0,
+                label=of_noise if axes is series[-1] else None,
+            )  # fmt: skip
+            if k != there[0]:
+                axes.axvline(begins, color=_AXIS, lw=0.8)
         begins = ends
         shown = m.in_frequency
         spectrum.loglog(shown.frequency, shown.residual, color=_MEASURED, label=of_model and "residual")
@@ -91,8 +99,9 @@ def _draw_output(part, diagnosis: Diagnosis, name: str) -> None:
             spectrum.loglog(shown.frequency, shown.residual_after, color=_MODEL, label=of_extended)
         spectrum.loglog(shown.frequency, shown.noise, color=_COMMAND, label=of_noise and "noise")
     along = "time (s)" if len(there) == 1 else "time, records one after the other (s)"
-    series.set(xlabel=along, ylabel=f"residual of\n{_words(name)} {label}")
-    _legend(series)
+    series[-1].set(xlabel=along)
+    series[0].set(ylabel=f"residual of\n{_words(name)} {label}")
+    _legend(*series)
     spectrum.set(xlabel="frequency (Hz)", ylabel=f"power ({unit}²/Hz)" if unit else "power (1/Hz)")
     _legend(spectrum)
     for panel, quantity in enumerate(_most_telling([m.against for m in found])):
