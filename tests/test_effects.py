@@ -2,13 +2,18 @@
 
 import inspect
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import ehsvjax
+from ehsvjax import kernels
 from ehsvjax.effects import BANK, Effect, amplitude, attach, candidates, effects_of
 from ehsvjax.effects.internal import contexts_of, internal_signals
 from ehsvjax.effects.of_model import effects_for
+from ehsvjax.population import cast, population_cost
+from ehsvjax.unknowns import problem_of
 from tests.compilations import compilations
 from tests.hidden_plants import effect_sizes, held_levels, servovalve_with, van_der_pol_with
 from tests.small_models import damper
@@ -109,6 +114,38 @@ def test_every_effect_is_what_an_independent_plant_has(make, plant, period, comm
         if effect < 3 * exact or error > 0.02 * effect + exact:
             off[name] = (float(effect), float(error))
     assert off == {}
+
+
+@pytest.mark.parametrize(("make", "period"), [(ehsvjax.servovalve, 1e-3), (ehsvjax.van_der_pol, 0.02)])
+def test_every_effect_leaves_a_search_in_one_native_function(make, period, monkeypatch):
+    model, _ = everything_attached(make(), 1.0)
+    time = np.arange(len(COMMAND)) * period
+    record = ehsvjax.Record(time, {"command": COMMAND}, {"position": np.sin(time)})
+    compiled = []
+
+    def in_blocks(function, rows):
+        compiled.append(kernels._compiles_inside(jax.make_jaxpr(function)(rows).jaxpr))
+        return function(rows)
+
+    monkeypatch.setattr(kernels, "in_blocks", in_blocks)
+    problem = cast(problem_of(model, [record]), jnp.float32)
+    jax.eval_shape(population_cost, problem, jnp.full((2, problem.unknowns), 0.5, jnp.float32))
+    assert compiled == [True]
+
+
+@pytest.mark.parametrize(("effect", "value"), [("transport_delay.delay", 0.033), ("input_lag.time_constant", 0.05)])
+def test_what_precedes_a_model_is_identified_with_it(effect, value):
+    model = attach(ehsvjax.van_der_pol(), {effect: (0.0, 0.2)}, duration=6.0, bank=BANK)
+    rng = np.random.default_rng(3)
+    command = np.repeat(rng.uniform(-2.0, 2.0, 10), 30)
+    plant = {"input_lag": {"time_constant": value}, "transport_delay": {"delay": value}}
+    name = effect.partition(".")[0]
+    position = van_der_pol_with([{name: plant[name]}], command[None], 0.02)["position"][0]
+    noisy = position + rng.normal(0.0, 0.01, len(command))
+    record = ehsvjax.Record(np.arange(len(command)) * 0.02, {"command": command}, {"position": noisy})
+    # Of this size a population filled one block, and XLA aborted on what the kernel left outside.
+    fit = ehsvjax.identify(model, record, key=jax.random.key(0), population=96, generations=10)
+    assert abs(fit.parameters[effect] - value) < 4.0 * fit.standard_errors[effect]
 
 
 @pytest.mark.parametrize("stiffness", [1e7, 1e8])

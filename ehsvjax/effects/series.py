@@ -56,6 +56,11 @@ def _legendre(fraction):
 _AT_NODES = np.array([[1.0, 1.0, 1.0], [-3.0, 0.0, 3.0], [5.0, -2.5, 5.0]])
 
 
+def _product(left, right):
+    """Matrix product of small matrices, written out: no native function holds a call of a library (see kernels)."""
+    return sum(left[:, k, None] * right[k][None].astype(left.dtype) for k in range(left.shape[1]))
+
+
 def _delayed(own, course, context):
     """Delay by any time; before the record it was zero."""
     samples = own["delay"] / context["sample_period"]
@@ -70,10 +75,8 @@ def _delayed(own, course, context):
         """Of a piece of a period, which begins at one fraction of that and arrives at one of the delayed."""
         f = begins + length * points
         by_node = jnp.stack([(2.0 * f - 1.0) * (f - 1.0), 4.0 * f * (1.0 - f), f * (2.0 * f - 1.0)])
-        to_node = (
-            ((length * weights)[None] * by_node) @ _legendre(arrives + length * points) @ _AT_NODES.astype(course.dtype)
-        )
-        return sum(nodes[:, j, None] * to_node[j, None] for j in range(3))
+        moments = _product((length * weights)[None] * by_node, _legendre(arrives + length * points))
+        return _product(nodes, _product(moments, _AT_NODES))
 
     return moved(earlier[:-1], 1.0 - part, part, 0.0) + moved(earlier[1:], 0.0, 1.0 - part, part)
 
@@ -94,8 +97,8 @@ def _lagged(own, course, context):
     first = (2.0 * mean - 1.0 - decay) / ratio
     by_parts = jnp.stack([mean, first, mean + 6.0 * first / ratio])
     points, weights = (jnp.asarray(each, course.dtype) for each in _gauss(5))
-    by_points = (weights * jnp.exp(-jnp.minimum(ratio, 1.0) * points)) @ _legendre(points)
-    moments = jnp.where(ratio < 1.0, by_points, by_parts) @ _AT_NODES.astype(course.dtype)
+    by_points = _product((weights * jnp.exp(-jnp.minimum(ratio, 1.0) * points))[None], _legendre(points))[0]
+    moments = _product(jnp.where(ratio < 1.0, by_points, by_parts)[None], _AT_NODES)[0]
 
     # What follows a straight line is that line, later by the time constant, but for what decays.
     start, middle, end = course.T
