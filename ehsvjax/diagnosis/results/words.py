@@ -62,13 +62,21 @@ def verdict(diagnosis: "Diagnosis") -> str:
 
 
 def _explained(diagnosis: "Diagnosis") -> str:
-    """Return which share of what was wrong the causes explain on data that were not used, where chance could not."""
+    """Return which share of what was wrong the causes explain, on which data, where chance could not."""
     shares = {n: g.share_removed for n, g in diagnosis.gain.outputs.items() if g.share_interval[0] > 0.0}
     if not shares:
         return ""
     each = [f"{100 * min(share, 1.0):.0f}%" + (f" ({name})" if len(diagnosis.gain.outputs) > 1 else "")
             for name, share in shares.items()]  # fmt: skip
-    return f" {' and '.join(each)} of what was wrong is explained, on data that were not used."
+    fitted = diagnosis.gain.left_open
+    on = (
+        "data that were fitted"
+        if all(fitted)
+        else "data of which some were fitted"
+        if any(fitted)
+        else "data that were not used"
+    )
+    return f" {' and '.join(each)} of what was wrong is explained, on {on}."
 
 
 def _left(diagnosis: "Diagnosis") -> str:
