@@ -189,6 +189,13 @@ class Noise(NamedTuple):
         """Of the innovations of each output, in its unit squared: of what a sample tells alone."""
         return np.array([[noise.innovation_variance for noise in of_record] for of_record in self.of])
 
+    def excess(self, residual: Float[np.ndarray, "record time signal"]) -> Float[np.ndarray, "record signal"]:
+        """Return how many times the noise's mean square a residual has, at least one: arithmetic that is as good for
+        its size is good enough, as gains count in variances of what is left.
+        """
+        squares = np.sum(np.where(self.measured, residual, 0.0) ** 2, axis=1) / self.variances
+        return np.maximum(squares / np.maximum(self.measured.sum(axis=1), 1), 1.0)
+
     def variance_of(self, signal: int) -> float:
         """Return the variance of one output's noise, the mean over the records."""
         counts = self.measured[..., signal].sum(axis=1)

@@ -53,8 +53,8 @@ class Integration(NamedTuple):
     Attributes:
         step_size: s.
         left_out: output -> readings beside a jump, which no such step knows or no unknown places: they carry no weight.
-        worth: noise variances by which halving the step changes the difference of any two explanations' sums of
-            squares, at most; of what is more than 25 behind, in twenty-fifths of that.
+        worth: variances of what is left by which halving the step changes the difference of any two explanations' sums
+            of squares, at most; of what is more than 25 behind, in twenty-fifths of that.
 
     """
 
@@ -217,13 +217,15 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
 def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
     """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them.
 
-    The first is the best. Where another is far behind, its arithmetic counts as a part of that.
+    The first is the best, and no difference counts for more than what it leaves. Where another is far behind, its
+    arithmetic counts as a part of that.
     """
-    outputs_at = bench.stepped(points)
-    known = settled(bench, outputs_at, noise.innovation_variances)
+    outputs_at, readings = bench.stepped(points), bench.problem.samples.outputs
+    excess = noise.excess(readings - outputs_at(int(bench.problem.substeps))[0])
+    known = settled(bench, outputs_at, noise.innovation_variances * excess)
     here = int(known.problem.substeps)
     coarse, fine = (
-        np.sum(noise.scaled(known.problem.samples.outputs - outputs_at(substeps)) ** 2, axis=-1)
+        np.sum(noise.scaled((readings - outputs_at(substeps)) / np.sqrt(excess)[:, None]) ** 2, axis=-1)
         for substeps in (here, 2 * here)
     )
     behind = np.maximum(1.0, (fine - fine[0]) / _WEIGHED)
@@ -285,7 +287,8 @@ def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: No
     """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
     while True:
         bench = trials.bench
-        known = without_jumps(settled(bench, bench.stepped(current.points), noise.innovation_variances), current, noise)
+        variances = noise.innovation_variances * noise.excess(current.residual[0])
+        known = without_jumps(settled(bench, bench.stepped(current.points), variances), current, noise)
         if known is bench:
             return trials, current
         trials = trials._replace(bench=known)
