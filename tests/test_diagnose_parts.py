@@ -378,3 +378,12 @@ def test_misfit_that_lasts_counts_once_however_short_the_parts_are(monkeypatch):
         # parts gave 8 and 18% of gains that are so large, and 19 and 32% where they were half as long.
         assert np.mean(gains > chi2.isf(0.01, 1)) < 0.045, parts
         assert np.mean(gains > chi2.isf(0.05, 1)) < 0.115, parts
+
+
+def test_arithmetic_is_asked_for_what_is_left_and_for_no_less_than_the_noise():
+    measured = np.ones((2, 300, 2), bool)
+    measured[1, 100:, 0] = False
+    residual = np.full(measured.shape, 0.1)
+    residual[0, :, 1], residual[1, 100:, 0] = 6.0, np.nan
+    excess = plain_noise(np.array([4.0, 9.0]), measured).excess(residual)
+    np.testing.assert_allclose(excess, [[1.0, 4.0], [1.0, 1.0]])

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 import ehsvjax
-from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
+from ehsvjax.diagnosis import recipe
+from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN, verdict_of
 from tests.small_models import carriage, carriage_plant, record_of
 
 PERIOD, SAMPLES, KEY = 0.02, 1500, jax.random.key(0)
@@ -44,3 +45,19 @@ def test_a_repeat_of_the_experiment_settles_it(chance):
     else:
         assert PROCESS_NOISE not in {*found.names, *(name for a in found.alternatives for name in a.causes)}, str(found)
         assert found.verdict != "adequate", str(found)
+
+
+def test_what_leaves_something_and_predicts_nothing_may_stand_for_what_the_bank_lacks(monkeypatch):
+    given = []
+    monkeypatch.setattr(recipe, "verdict_of", lambda *all_of_it: given.append(all_of_it) or verdict_of(*all_of_it))
+    found = diagnosed([shaken(3.0, 1)])
+    ((examined, predicts),) = given
+    assert predicts and found.gain.predicts and found.innocent, str(found)
+    assert not found.gain._replace(left_open=(True,)).predicts
+    left = examined._replace(innocent=False)
+    sure, unsure = (verdict_of(left, told) for told in (True, False))
+    for group, open_group in zip(sure.groups, unsure.groups, strict=True):
+        assert UNKNOWN not in group
+        assert open_group == {name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5}
+    assert unsure.word == "ambiguous" and "another record" in unsure.alternatives[0].settled_by
+    assert verdict_of(examined, False) == verdict_of(examined, True)

@@ -130,7 +130,8 @@ def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...],
     selection, wider = examined.selection, nominal
     if selection.included:
         wider = as_fit(selection, selection.final, selection.included)
-    return wider, gain_of(selection, nominal, wider, validation, rng), verdict_of(examined)
+    gain = gain_of(selection, nominal, wider, validation, rng)
+    return wider, gain, verdict_of(examined, gain.predicts)
 
 
 def _check(fit, records, validation, key, progress) -> None:

@@ -11,7 +11,7 @@ from ehsvjax.diagnosis.bench.refits import noise_of_all_left
 from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.repeats import repeats_itself
 from ehsvjax.diagnosis.decision.search import Selection
-from ehsvjax.diagnosis.hypotheses.curves import terms_at
+from ehsvjax.diagnosis.hypotheses.curves import TIME, terms_at
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence, dependences
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term, told_by
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise, process_noise
@@ -142,8 +142,8 @@ def _must_be_better_by(selection: Selection, innocent: bool) -> float:
 def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
     """Return a term of free form that explains the record as well as all causes together, and whether better.
 
-    It is not better if the causes predict the unused data of any record better, be it by chance: what follows any data
-    that it is refitted to must at least predict.
+    It is not better if the causes predict the unused data of any record better: what follows any data that it is
+    refitted to must at least predict. What depends on time alone does not: no other record would have it.
     """
     causes = selection.included
     if not before or not causes or (innocent and len(causes) == 1):
@@ -160,7 +160,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
         unused.noise.of_record(k).gained(unused.residual[0], selection.unused.residual[0])
         for k in range(len(bench.records))
     ]
-    return term, max(contradicted) < 0.0
+    return term, term.quantity != TIME and max(contradicted) < INSEPARABLE
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:

@@ -182,7 +182,7 @@ class _Weighed(NamedTuple):
         needs: for each cause what the fit needs it for.
         unused: what is left of unused data with all causes, without each of them, and without any.
         needless: the cause that is needed least, if the record can do without it.
-        worth: noise variances by which halving the step changes the difference of any two of them.
+        worth: variances of what is left by which halving the step changes the difference of any two of them.
 
     """
 

@@ -14,7 +14,7 @@ from ehsvjax.readings import lattice
 QUANTISATION = "sensor_quantisation"
 PROCESS_NOISE = "process_noise"
 UNKNOWN = "unknown_term"
-"""What no effect of the bank is: in one record it may look like chance."""
+"""What no effect of the bank is: in one record it may look like chance, or like what does not predict another."""
 # Step of the readings' lattice, in deviations of the other noise, beyond which it is a cause.
 _COARSEST = 2.2
 
@@ -48,11 +48,20 @@ class Verdict(NamedTuple):
     alternatives: tuple[Alternative, ...]
 
 
-def verdict_of(examined: Examination) -> Verdict:
-    """Return the verdict, with the causes and what could be there instead."""
+def verdict_of(examined: Examination, predicts: bool) -> Verdict:
+    """Return the verdict, with the causes and what could be there instead.
+
+    Args:
+        examined: the causes, and what they leave.
+        predicts: whether they predict data that were not used.
+
+    """
     selection, bench = examined.selection, examined.selection.bench
     order = np.argsort([-need.gain for need in selection.needs]).tolist()
     groups = [_group(examined, k) for k in order]
+    if not (examined.innocent or predicts):
+        # What leaves something, and predicts nothing, may as well stand for what the bank lacks.
+        groups = [{name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5} for group in groups]
     if examined.lacking or not (examined.innocent or groups):
         return Verdict("unexplained", (), (), ())
     others = [{name: 1.0} for name in _quantised(selection)]
@@ -114,4 +123,5 @@ def _quantised(selection: Selection) -> tuple[str, ...]:
 def _settled_by(bench: Workbench, group: tuple[str, ...]) -> str:
     ways = {c.name: c.effect.settled_by for c in bench.candidates if c.effect.settled_by}
     ways[PROCESS_NOISE] = "the same experiment again: chance does not repeat itself"
+    ways[UNKNOWN] = "another record, or a longer one, which causes that are there predict"
     return "; ".join(dict.fromkeys(f"{name}: {ways[name]}" for name in group if name in ways))

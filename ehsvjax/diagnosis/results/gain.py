@@ -55,6 +55,11 @@ class Gain(NamedTuple):
     on: str
     left_open: tuple[bool, ...]
 
+    @property
+    def predicts(self) -> bool:
+        """Whether the extended model predicts some output better than the model does, and not by chance."""
+        return not all(self.left_open) and any(g.share_interval[0] > 0.0 for g in self.outputs.values())
+
 
 class _Judged(NamedTuple):
     """One record, or a part of it, that was not used, by output: residuals before and after, readings, the noise."""

@@ -40,7 +40,7 @@ def integration_line(diagnosis: "Diagnosis") -> str:
     much = "" if worth < 1.0 else ": more than it should; simulate the model with a method for stiff equations"
     return (
         f"simulated in steps of {quantity(step, 's')}: at half of it no comparison changes by more than "
-        f"{max(worth, 0.01):.2g} noise variances{much}{unknown}"
+        f"{max(worth, 0.01):.2g} variances of what is left{much}{unknown}"
     )
 
 
