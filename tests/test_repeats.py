@@ -7,6 +7,7 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnosis import recipe
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN, verdict_of
+from ehsvjax.diagnosis.results.explanations import explanations_of
 from tests.small_models import carriage, carriage_plant, record_of
 
 PERIOD, SAMPLES, KEY = 0.02, 1500, jax.random.key(0)
@@ -61,3 +62,6 @@ def test_what_leaves_something_and_predicts_nothing_may_stand_for_what_the_bank_
         assert open_group == {name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5}
     assert unsure.word == "ambiguous" and "another record" in unsure.alternatives[0].settled_by
     assert verdict_of(examined, False) == verdict_of(examined, True)
+    # What the bank lacks is no model that an experiment could be planned to tell from the cause.
+    alone = unsure._replace(groups=({found.names[0]: 0.5, UNKNOWN: 0.5},))
+    assert explanations_of(examined.selection, alone) == ()

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from ehsvjax.diagnosis.decision.search import Selection
-from ehsvjax.diagnosis.decision.verdict import Verdict
+from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN, Verdict
 from ehsvjax.diagnosis.results.extension import as_fit
 from ehsvjax.fit import Fit
 
@@ -32,15 +32,15 @@ def explanations_of(selection: Selection, verdict: Verdict) -> tuple[Explanation
     """
     found = []
     for group, position in zip(verdict.groups, verdict.included, strict=True):
-        if position is None or len(group) == 1:
+        names = set(group) - {PROCESS_NOISE, UNKNOWN}
+        if position is None or len(names) < 2:
             continue
-        names = dict.fromkeys(group)
         rest = tuple(i for i in selection.included if i != position)
         for rival in selection.rivals[selection.included.index(position)]:
             name = selection.bench.candidates[rival.candidate].name
             # Of several forms of one effect the best stands for all.
             if name in names:
-                del names[name]
+                names.remove(name)
                 fit = as_fit(selection, rival.refitted, (*rest, rival.candidate))
                 found.append(Explanation(name, next(iter(group)), group[name], fit))
     return tuple(found)
