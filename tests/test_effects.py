@@ -138,9 +138,8 @@ def test_what_precedes_a_model_is_identified_with_it(effect, value):
     model = attach(ehsvjax.van_der_pol(), {effect: (0.0, 0.2)}, duration=6.0, bank=BANK)
     rng = np.random.default_rng(3)
     command = np.repeat(rng.uniform(-2.0, 2.0, 10), 30)
-    plant = {"input_lag": {"time_constant": value}, "transport_delay": {"delay": value}}
-    name = effect.partition(".")[0]
-    position = van_der_pol_with([{name: plant[name]}], command[None], 0.02)["position"][0]
+    name, number = effect.split(".")
+    position = van_der_pol_with([{name: {number: value}}], command[None], 0.02)["position"][0]
     noisy = position + rng.normal(0.0, 0.01, len(command))
     record = ehsvjax.Record(np.arange(len(command)) * 0.02, {"command": command}, {"position": noisy})
     # Of this size a population filled one block, and XLA aborted on what the kernel left outside.

@@ -152,7 +152,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
     better = noise.gained(selection.final.residual[0], term.residual)
     better += sum(_price(selection, i) for i in causes)
-    if not better > float(np.log(noise.measured.sum())) * term.pieces + INSEPARABLE:
+    if term.quantity == TIME or not better > float(np.log(noise.measured.sum())) * term.pieces + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
     with_it = nominal._replace(residual=term.residual[None])
     unused = predicted(bench, [()], [with_it], noise, lambda known: told_by(bench, nominal, known, curve))
@@ -160,7 +160,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
         unused.noise.of_record(k).gained(unused.residual[0], selection.unused.residual[0])
         for k in range(len(bench.records))
     ]
-    return term, term.quantity != TIME and max(contradicted) < INSEPARABLE
+    return term, max(contradicted) < INSEPARABLE
 
 
 def _likelihood(noise: Noise, term: MissingTerm) -> float:
