@@ -372,7 +372,7 @@ def test_misfit_that_lasts_counts_once_however_short_the_parts_are(monkeypatch):
     misfit = 5.0 * np.sqrt(1.0 - decay**2) * slow + rng.standard_normal(slow.shape)
     left = misfit - np.outer(misfit @ direction, direction) / (direction @ direction)
     for parts in (20, 40):
-        monkeypatch.setattr("ehsvjax.diagnosis.bench.noise._PARTS", parts)
+        monkeypatch.setattr("ehsvjax.diagnosis.bench.noise.PARTS", parts)
         gains = np.array([noise.gained(series(a), series(b)) for a, b in zip(misfit, left, strict=True)])
         # A likelihood ratio of a few strokes is not quite a chi square (4 and 10% of many draws); taken one by one the
         # parts gave 8 and 18% of gains that are so large, and 19 and 32% where they were half as long.

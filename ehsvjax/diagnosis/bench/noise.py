@@ -5,13 +5,16 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
+import functools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ehsvjax.diagnosis.bench.discrepancy import Discrepancy, Disturbances, discrepancies, variance_along
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
+from ehsvjax.diagnosis.bench.parts import PARTS
 from ehsvjax.precision.residual_noise import (
     ResidualNoise,
     autocovariance,
@@ -24,13 +27,10 @@ _NEGLIGIBLE = 1e-3
 # Rounds of an estimate of coloured noise at most, the share by which the last one changes it, and the share of the
 # change before that each may have.
 _ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
-# Of a record, between which an explanation's gain may differ.
-_PARTS = 20
-# Standard errors of the correlation of neighbouring parts that chance seldom exceeds (one-sided, 10%).
-_LASTS = 1.28
 
 
-class Noise(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Noise:
     """What a model leaves if it is right: of each output in each record, white or an autoregression.
 
     Refits are by least squares, which no noise deceives; what differs between two of them counts in the variance of
@@ -39,11 +39,13 @@ class Noise(NamedTuple):
     Attributes:
         of: `[record][signal]` the noise of each output, in its unit.
         measured: `[record, time, signal]` readings that count.
+        disturbances: of which what is left of a model that lacks something looks like sums; None for noise alone.
 
     """
 
     of: tuple[tuple[ResidualNoise, ...], ...]
     measured: Bool[np.ndarray, "record time signal"]
+    disturbances: Disturbances | None = None
 
     def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
         """Return the readings that count in deviations of the noise, one output after the other."""
@@ -133,37 +135,42 @@ class Noise(NamedTuple):
         """
         from scipy.special import chdtrc
 
-        of_noise = self.along(direction)
         part_of, squares = self._part_of, float(direction @ direction)
+        expected = self.along(direction) + variance_along(self._discrepancies, direction / np.sqrt(squares), left)
         shares = np.bincount(part_of, direction**2) / squares
         parts = 1.0 / float(shares @ shares)
-        sums = np.bincount(part_of, direction * left, minlength=_PARTS * len(self.measured)).reshape(-1, _PARTS)
+        sums = np.bincount(part_of, direction * left, minlength=PARTS * len(self.measured)).reshape(-1, PARTS)
         own = float(np.sum(sums**2))
         between = own / squares
-        if not chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
-            return of_noise, np.inf
-        alike = float(np.sum(sums[:, 1:] * sums[:, :-1])) / own
-        if alike * np.sqrt(parts) > _LASTS:
-            between *= min((1.0 + alike) / (1.0 - alike), parts)
+        if not chdtrc(parts, parts * between / expected) < SIGNIFICANT:
+            return expected, np.inf
         return between, parts
+
+    @functools.cached_property
+    def _discrepancies(self) -> tuple[Discrepancy, ...]:
+        return () if self.disturbances is None else discrepancies(self.disturbances, self.scaled, self.products)
 
     def of_record(self, record: int) -> "Noise":
         """Return the noise with the readings of one record alone."""
         there = np.arange(len(self.measured)) == record
-        return self._replace(measured=self.measured & there[:, None, None])
+        return replace(self, measured=self.measured & there[:, None, None])
 
     def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
         """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""
-        if not self.coloured:
-            return 1.0
         flat = directions.reshape(-1, directions.shape[-1])
-        series = np.zeros((*self._in_turn.shape, len(flat)))
-        series[self._in_turn] = flat.T
-        through = sum(
-            float(np.trace(meat(series[i, k][None], noise))) / noise.variance
+        return float(np.trace(self.products(flat)) / np.sum(flat**2))
+
+    def products(self, directions: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "direction direction"]:
+        """Return the covariance of scaled noise's products with some directions of scaled readings."""
+        if not self.coloured:
+            return directions @ directions.T
+        series = np.zeros((*self._in_turn.shape, len(directions)))
+        series[self._in_turn] = directions.T
+        each = (
+            meat(series[i, k][None], noise) / noise.variance
             for k, of_record in enumerate(self.of) for i, noise in enumerate(of_record)
         )  # fmt: skip
-        return through / float(np.sum(flat**2))
+        return np.sum([*each], axis=0)
 
     @property
     def known(self) -> Bool[np.ndarray, "record time signal"]:
@@ -219,8 +226,8 @@ class Noise(NamedTuple):
     def _part_of(self) -> Int[np.ndarray, " sample"]:
         """The part of its record in which each scaled reading lies, counted on from record to record."""
         counted = np.cumsum(self.measured.any(axis=-1), axis=1)
-        within = np.maximum(counted - 1, 0) * _PARTS // np.maximum(counted[:, -1:], 1)
-        return np.broadcast_to(within + _PARTS * np.arange(len(within))[:, None], self._in_turn.shape)[self._in_turn]
+        within = np.maximum(counted - 1, 0) * PARTS // np.maximum(counted[:, -1:], 1)
+        return np.broadcast_to(within + PARTS * np.arange(len(within))[:, None], self._in_turn.shape)[self._in_turn]
 
 
 def _first_innovations(noise: ResidualNoise) -> Float[np.ndarray, "sample sample"]:

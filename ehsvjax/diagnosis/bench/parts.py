@@ -7,8 +7,11 @@ from jaxtyping import Float, Int
 
 from ehsvjax.diagnosis.bench.workbench import Workbench
 
+PARTS = 20
+"""Of a record, between which what is left of it may differ."""
+# The parts in which what is known of one is simulated.
 _PARTS = 200
-_LEAST_SAMPLES = 10
+_LEAST_SAMPLES = 2
 
 
 class Parts(NamedTuple):

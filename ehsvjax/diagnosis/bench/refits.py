@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ehsvjax.diagnosis.bench.discrepancy import span
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
 from ehsvjax.diagnosis.bench.workbench import ABREAST, TOLD_APART, Workbench
 
@@ -47,14 +48,12 @@ class Refits(NamedTuple):
         return Refits(*(field[list(some)] for field in self))
 
 
-def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
-    """Return an orthonormal basis of what the unknowns can do to first order."""
-    norms = np.linalg.norm(slopes, axis=1)
-    kept = slopes[norms > 0] / norms[norms > 0, None]
-    if not len(kept):
-        return np.zeros((slopes.shape[1], 0))
-    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
-    return vectors[:, values > TOLD_APART * values[0]]
+@runtime_checkable
+class Weighing(Protocol):
+    """What a refit's readings count by."""
+
+    def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return the readings that count in deviations of what is of chance in them."""
 
 
 def unexplained(
@@ -86,7 +85,7 @@ def refit(
     bench: Workbench,
     starts: Float[np.ndarray, "individual parameter"],
     chosen: Int[np.ndarray, "individual direction"],
-    noise: Noise,
+    noise: Weighing,
     iterations: int = _ITERATIONS,
     race: bool = True,
 ) -> Refits:
@@ -100,7 +99,7 @@ def refit(
         bench: the trials' workbench.
         starts: points.
         chosen: columns of the unknowns of each start; -1 is padding.
-        noise: of the noise.
+        noise: by which readings are weighed.
         iterations: at most this many steps.
         race: whether the starts compete: what is far behind the best is given up.
 
@@ -168,7 +167,7 @@ def _linearised(bench: Workbench, at, trial, chosen):
             yield i, outputs[row], slopes[:, row]
 
 
-def _led_roughly(bench: Workbench, starts, chosen, noise: Noise, race) -> Float[np.ndarray, "individual parameter"]:
+def _led_roughly(bench: Workbench, starts, chosen, noise: Weighing, race) -> Float[np.ndarray, "individual parameter"]:
     """Return where each start leads at a step that is many times longer, or itself where that is better.
 
     Most of the way to a minimum needs no exact arithmetic; what is compared in the end has it.

@@ -7,10 +7,11 @@ import numpy as np
 
 from ehsvjax.diagnosis.bench.evidence import CONVINCING, INSEPARABLE, SIGNIFICANT
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.refits import noise_of_all_left
+from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left
 from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.repeats import repeats_itself
 from ehsvjax.diagnosis.decision.search import Selection
+from ehsvjax.diagnosis.decision.trials import with_only
 from ehsvjax.diagnosis.hypotheses.curves import TIME, terms_at
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence, dependences
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term, told_by
@@ -24,13 +25,15 @@ class Examination(NamedTuple):
     """What is left of the residual, and of the causes.
 
     Attributes:
-        selection: with the noise of what is left; without causes if chance, a random force, explains more.
+        selection: with the noise of what is left; without causes if chance, a random force, explains all.
         before: what the nominal model's residual depends on, the most significant first.
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
         undecided: whether it is nothing if all that is left is noise: one record does not tell.
-        chance: the random force that explains the nominal model's residual better than any cause; None if none does.
-        chance_behind: noise variances by which a random force explains it worse than all causes together.
+        chance: the random force that explains the nominal model's residual better than any cause, or what all causes
+            leave; None if none does.
+        chance_behind: noise variances by which a random force alone is behind all causes together, what it has to be
+            better by included.
         instead: one term of free form that explains the record as well as all causes together, but for the price of
             its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -46,11 +49,6 @@ class Examination(NamedTuple):
     chance_behind: float
     instead: MissingTerm | None
     lacking: bool
-
-    @property
-    def chance_deficit(self) -> float:
-        """By how much a random force is behind the causes, with what it has to be better by."""
-        return self.chance_behind + _must_be_better_by(self.selection, self.innocent)
 
 
 def examine(selection: Selection) -> Examination:
@@ -70,9 +68,11 @@ def examine(selection: Selection) -> Examination:
         undecided = everything.coloured and not _significant(dependences(selection.final, everything, terms))
     repeated = repeats_itself(bench, selection.final.residual[0], noise) if undecided else None
     innocent = repeated is False or not _significant(after)
-    chance, chance_behind = _random_force(selection, before, innocent)
+    chance, chance_behind, alone = _random_force(selection, before, after, innocent)
+    if alone:
+        selection, after = selection.without_causes(), before
     if chance is not None:
-        selection, after, innocent = selection.without_causes(), before, True
+        innocent = True
     elif innocent:
         # Then all of it tells of the noise, and more than what lies outside all responses.
         selection = replace(selection, noise=noise_of_all_left(bench, selection.final))
@@ -105,33 +105,55 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
 
 
 def _random_force(
-    selection: Selection, before: tuple[Dependence, ...], innocent: bool
-) -> tuple[ProcessNoise | None, float]:
-    """Return the random force that explains the nominal model's residual better than any cause, if there is one.
+    selection: Selection, before: tuple[Dependence, ...], after: tuple[Dependence, ...], innocent: bool
+) -> tuple[ProcessNoise | None, float, bool]:
+    """Return the random force that explains the records better than any cause, or else what the causes leave of them.
 
-    What the causes seemed to explain was then the motion that the force had left behind. And by how much it explains it
-    worse than they do.
+    And by how much the force alone explains the records worse than the causes do; and whether it is alone: what the
+    causes seemed to explain was then the motion that it had left behind.
     """
-    bench = selection.bench
-    nominal = process_noise(bench, selection.nominal, selection.noise)
-    if nominal is None or not nominal.likelihood - nominal.of_sensor > CONVINCING:
-        return None, np.inf
-    repeated = repeats_itself(bench, selection.nominal.residual[0], selection.noise)
+    bench, noise = selection.bench, selection.noise
+    # What the causes have made of the model's unknowns may be nearer.
+    found = with_only(bench, selection.final.points[0], ())
+    alone, behind = process_noise(bench, selection.nominal, noise, [found]), np.inf
+    beside = process_noise(bench, selection.final, noise) if selection.included else None
+    chance = None
+    if beside is not None and _shows(beside):
+        chance = _chance_in(selection, selection.final, beside, after)
+    if alone is not None and _shows(alone):
+        if not selection.included:
+            behind = -np.inf
+        elif chance is not None:
+            # Beside a force they must gain what anything else must that is added.
+            behind = chance.likelihood - alone.likelihood - sum(need.required for need in selection.needs)
+        elif beside is not None:  # else the causes have made any force invisible
+            behind = beside.of_sensor - alone.likelihood - _least_price(selection)
+            behind += _must_be_better_by(selection, innocent)
+        if behind < 0.0:
+            instead = _chance_in(selection, selection.nominal, alone, before)
+            return (None, np.inf, False) if instead is None else (instead, behind, True)
+    return chance, behind, False
+
+
+def _shows(force: ProcessNoise) -> bool:
+    return force.likelihood - force.of_sensor > CONVINCING
+
+
+def _chance_in(
+    selection: Selection, refitted: Refits, force: ProcessNoise, tests: tuple[Dependence, ...]
+) -> ProcessNoise | None:
+    """Return a random force that shows in what a refit leaves, if that is chance.
+
+    What repeats itself is none, and a term that depends on what runs along the model is a better reason.
+    """
+    repeated = repeats_itself(selection.bench, refitted.residual[0], selection.noise)
     if repeated:
-        return None, np.inf
-    behind = -np.inf
-    if selection.included:
-        final = process_noise(bench, selection.final, selection.noise)
-        # Where no force shows any more, the causes have made it invisible.
-        behind = np.inf if final is None else final.of_sensor - nominal.likelihood - _least_price(selection)
-        if not behind < -_must_be_better_by(selection, innocent):
-            return None, behind
-    if _significant(before):
-        # A term that depends on what runs along the model is a better reason than chance.
-        term, _ = missing_term(bench, selection.nominal, selection.noise, selection.seen, _suspects(before))
-        if _likelihood(selection.noise, term) > nominal.likelihood:
-            return None, np.inf
-    return nominal._replace(settled=repeated is False), behind
+        return None
+    if _significant(tests):
+        term, _ = missing_term(selection.bench, refitted, selection.noise, selection.seen, _suspects(tests))
+        if _likelihood(selection.noise, term) > force.likelihood:
+            return None
+    return force._replace(settled=repeated is False)
 
 
 def _must_be_better_by(selection: Selection, innocent: bool) -> float:

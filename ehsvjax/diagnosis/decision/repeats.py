@@ -6,10 +6,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.parts import PARTS
 from ehsvjax.diagnosis.bench.workbench import Workbench
 
-# Of a record, which differ by chance from repeat to repeat.
-_PARTS = 20
 # Standard deviations by which the products of chance differ from nothing.
 _SAME = 3.0
 
@@ -21,7 +20,7 @@ def repeats_itself(bench: Workbench, residual: Float[np.ndarray, "record time si
     from zero is told by how it differs from part to part.
     """
     sums = [
-        np.array([part.sum() for part in np.array_split(_products(residual, noise, j, k), _PARTS)])
+        np.array([part.sum() for part in np.array_split(_products(residual, noise, j, k), PARTS)])
         for j, k in itertools.combinations(range(len(bench.records)), 2)
         if _same_experiment(bench, j, k)
     ]

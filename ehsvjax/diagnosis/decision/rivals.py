@@ -75,14 +75,20 @@ def rivals_again(
     for own, group in zip(included, groups, strict=True):
         rest = tuple(j for j in included if j != own)
         # Beside what has been swapped in for another cause, some have too many numbers.
-        able = [r for r in group if r.candidate != own and fits(trials.bench, (*rest, r.candidate))]
+        able = [r for r in group if r.candidate not in included and fits(trials.bench, (*rest, r.candidate))]
         found = _refitted_beside(trials, final, able, rest, noise)
         ranked.append(_ranked(trials, own, rest, {own: final} | found, noise))
     for own, group in zip(included, ranked, strict=True):
         if group[0].candidate != own:
             included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
             break
-    return included, final, tuple(ranked)
+    # What has taken one cause's place is no rival of another.
+    others = [set(included) - {group[0].candidate} for group in ranked]
+    return (
+        included,
+        final,
+        tuple(tuple(r for r in group if r.candidate not in other) for group, other in zip(ranked, others, strict=True)),
+    )
 
 
 def _refitted_beside(

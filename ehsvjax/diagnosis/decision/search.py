@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
+from ehsvjax.diagnosis.bench.discrepancy import disturbances_of
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
@@ -269,7 +270,10 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
             bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.waves
         )
         spanned = current.slopes[0], tried.changes, trials.terms.responses
-        noise = noise_outside(current.residual[0], measured, spanned)
+        noise = replace(
+            noise_outside(current.residual[0], measured, spanned),
+            disturbances=disturbances_of(trials.parts.values(), measured.shape[-1], current.slopes[0]),
+        )
         before = trials
         trials, current = _known(before, included, current, noise)
         if trials is before:

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax.diagnosis.bench.discrepancy import span
 from ehsvjax.diagnosis.bench.noise import Noise
+from ehsvjax.diagnosis.bench.parts import Parts, parts_at
 from ehsvjax.diagnosis.bench.progress import Progress
-from ehsvjax.diagnosis.bench.refits import Refits, padded, refit, span
+from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.diagnosis.hypotheses.curves import Terms, every_curve, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import Waves, waves_of
@@ -34,6 +36,7 @@ class Trials(NamedTuple):
         bench: the workbench.
         seen: what runs along the nominal model and varies, by name.
         terms: of free form, at all places, and what they would do to the outputs of the nominal model.
+        parts: of the records, and what a disturbance over each does, by the signal that is disturbed.
         waves: what harmonic effects would do, by the candidate's name.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
@@ -43,6 +46,7 @@ class Trials(NamedTuple):
     bench: Workbench
     seen: dict[str, Float[np.ndarray, "record time"]]
     terms: Terms
+    parts: dict[str, Parts]
     waves: dict[str, Waves]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Progress
@@ -51,7 +55,9 @@ class Trials(NamedTuple):
 def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    return Trials(bench, seen, terms_at(bench, bench.nominal, every_curve(bench, seen)), waves_of(bench), {}, progress)
+    terms = terms_at(bench, bench.nominal, every_curve(bench, seen))
+    parts = {place: parts_at(bench, bench.nominal, place) for place in bench.places}
+    return Trials(bench, seen, terms, parts, waves_of(bench, parts), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:

@@ -65,7 +65,7 @@ def verdict_of(examined: Examination, predicts: bool) -> Verdict:
     if examined.lacking or not (examined.innocent or groups):
         return Verdict("unexplained", (), (), ())
     others = [{name: 1.0} for name in _quantised(selection)]
-    others += [_chance(examined.chance, examined.chance_behind)] if examined.chance else []
+    others += [_chance(examined, examined.chance)] if examined.chance else []
     included = (*(selection.included[k] for k in order), *(None for _ in others))
     every = (*groups, *others)
     if not every:
@@ -84,7 +84,7 @@ def _group(examined: Examination, k: int) -> dict[str, float]:
     selection = examined.selection
     rivals, need = selection.rivals[k], selection.needs[k]
     deficits = [rival.deficit for rival in rivals]
-    every = probabilities([*deficits, examined.chance_deficit, _nothing_behind(need)])
+    every = probabilities([*deficits, examined.chance_behind, _nothing_behind(need)])
     found: dict[str, float] = {}
     for rival, probable in zip(rivals, every, strict=False):
         name = selection.bench.candidates[rival.candidate].name
@@ -100,13 +100,16 @@ def _nothing_behind(need: Need) -> float:
     return need.gain - need.required
 
 
-def _chance(chance: ProcessNoise, behind: float) -> dict[str, float]:
-    """Return how probable a random force is against the causes that it was found in the place of.
+def _chance(examined: Examination, chance: ProcessNoise) -> dict[str, float]:
+    """Return how probable a random force is against the causes that it was found in the place of, or beside.
 
     Unless the experiment was repeated, nothing speaks for it against a term that the bank lacks.
     """
-    probable = float(probabilities([0.0, -behind])[0])
-    return {PROCESS_NOISE: probable} if chance.settled else {PROCESS_NOISE: probable / 2.0, UNKNOWN: probable / 2.0}
+    instead = not examined.selection.included
+    probable = float(probabilities([0.0, -examined.chance_behind])[0]) if instead else 1.0
+    if chance.settled:
+        return {PROCESS_NOISE: probable}
+    return {PROCESS_NOISE: probable / 2.0, UNKNOWN: probable / 2.0}
 
 
 def _quantised(selection: Selection) -> tuple[str, ...]:

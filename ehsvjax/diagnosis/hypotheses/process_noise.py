@@ -6,15 +6,20 @@ with a covariance that the model gives: q*H*H' + s*I for a force of intensity q 
 record, whose responses H are simulated, and an autoregression for the sensor.
 """
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import parts_at
-from ehsvjax.diagnosis.bench.refits import Refits, span
-from ehsvjax.diagnosis.bench.workbench import Workbench
+from ehsvjax.diagnosis.bench.refits import Refits, refit
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.precision.residual_noise import residual_noise
+
+# Rounds in which a random force and the unknowns under it settle, and what the last one gains at most.
+_ROUNDS, _SETTLED = 5, 0.1
 
 
 class ProcessNoise(NamedTuple):
@@ -37,11 +42,20 @@ class ProcessNoise(NamedTuple):
     settled: bool = False
 
 
-def process_noise(bench: Workbench, final: Refits, noise: Noise) -> ProcessNoise | None:
+def process_noise(
+    bench: Workbench, final: Refits, noise: Noise, also: Sequence[Float[np.ndarray, " parameter"]] = ()
+) -> ProcessNoise | None:
     """Compare a random force with noise of the sensor; None for several outputs, or where no force shows.
 
     By the samples that are used for any other explanation too, as `noise` says: likelihoods of others are no
     comparison.
+
+    Args:
+        bench: the trials' workbench.
+        final: a refit by least squares: what of it a sensor's noise leaves.
+        noise: of what is left.
+        also: other points from which its unknowns are refitted under a force.
+
     """
     kinds = {s.name: s.kind for s in bench.fit.model.signals}
     places = [p for p in bench.places if kinds[p] == "force"]
@@ -50,41 +64,91 @@ def process_noise(bench: Workbench, final: Refits, noise: Noise) -> ProcessNoise
     measured = noise.known[..., 0]
     # Each record in deviations of its own noise.
     deviation = np.sqrt(noise.innovation_variances)
-    known = span((final.slopes[0][..., 0] / deviation)[:, measured])
-    residual = final.residual[0][..., 0] / deviation
-    r = residual[measured]
-    r = r - known @ (known.T @ r)
-    parts = parts_at(bench, final.points[0], places[0])
-    h = (parts.responses[..., 0] / deviation)[:, measured]
-    h = h - (h @ known) @ known.T
-    if not h.any():
+    force = _refitted(bench, final, places[0], lambda series: (series[..., 0] / deviation)[..., measured], also)
+    if force is None:
         return None
-    intensity, force = _likelihood_of_force(h, r)
+    residual = final.residual[0][..., 0] / deviation
     sensor = sum(
         _likelihood_of_sensor(np.where(there, one, 0.0)[None], there[None])
         for one, there in zip(residual, measured, strict=True)
     )
     units = noise.log_units
-    return ProcessNoise(places[0], intensity * parts.length, 2.0 * force - units, 2.0 * sensor - units)
+    return ProcessNoise(places[0], force.intensity, 2.0 * force.likelihood - units, 2.0 * float(sensor) - units)
 
 
-def _likelihood_of_force(h, r) -> tuple[float, float]:
-    """Return the variance of the force of a part, and the log-likelihood, at their best."""
+class _Force(NamedTuple):
+    """A random force at its most likely: weighed by it and the sensor's noise, readings are white.
+
+    Attributes:
+        intensity: its spectral density.
+        likelihood: the logarithm of that of all readings.
+        unweighed: readings in deviations of the sensor's noise, as they are.
+        directions: `[sample, direction]` along which the force acts.
+        deviations: `[direction]` along each, in those of the noise.
+
+    """
+
+    intensity: float
+    likelihood: float
+    unweighed: Callable[[np.ndarray], np.ndarray]
+    directions: Float[np.ndarray, "sample direction"]
+    deviations: Float[np.ndarray, " direction"]
+
+    def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
+        """Return the readings in deviations of what is of chance in them."""
+        scaled = self.unweighed(series)
+        return scaled - ((scaled @ self.directions) * (1.0 - 1.0 / self.deviations)) @ self.directions.T
+
+
+def _refitted(
+    bench: Workbench,
+    final: Refits,
+    place: str,
+    scaled: Callable[[np.ndarray], np.ndarray],
+    also: Sequence[Float[np.ndarray, " parameter"]],
+) -> _Force | None:
+    """Refit a model's unknowns under a random force, by generalised least squares; None where no force shows.
+
+    The motion that a force leaves behind has led a refit by least squares far off.
+    """
+    best: _Force | None = None
+    refitted = final
+    for _ in range(_ROUNDS):
+        parts = parts_at(bench, refitted.points[0], place)
+        responses, residual = scaled(parts.responses), scaled(refitted.residual[0])
+        if not responses.any() or not np.isfinite(residual).all():
+            break
+        force = _most_likely(responses, scaled(refitted.slopes[0]), residual, parts.length, scaled)
+        if best is not None and not force.likelihood > best.likelihood + _SETTLED:
+            break
+        best = force
+        starts = np.stack([refitted.points[0], *also])
+        led = refit(bench, starts, np.repeat(final.chosen[:1], len(starts), axis=0), force, race=False)
+        refitted = led.of([int(np.argmin(led.cost))])
+    return best
+
+
+def _most_likely(responses, slopes, residual, length, scaled) -> _Force:
+    """Return the random force, of which parts have some length, s, that is most likely as the unknowns follow it."""
     from scipy.optimize import minimize_scalar
 
-    vectors, values, _ = np.linalg.svd(h.T, full_matrices=False)
-    z2 = (vectors.T @ r) ** 2
-    rest = max(float(r @ r - z2.sum()), 1e-300)
-    count = len(r)
+    directions, gains, _ = np.linalg.svd(responses.T, full_matrices=False)
+    norms = np.linalg.norm(slopes, axis=1)
+    both = np.column_stack([(slopes[norms > 0.0] / norms[norms > 0.0, None]).T, residual])
+    squares, along = both.T @ both, directions.T @ both
+    count = len(residual)
 
     def profiled(log_ratio):
-        spread = 1.0 + np.exp(log_ratio) * values**2
-        variance = (rest + np.sum(z2 / spread)) / count
-        return 0.5 * (count * np.log(variance) + np.sum(np.log(spread)) + count), variance
+        spread = 1.0 + np.exp(log_ratio) * gains**2
+        weighed = squares - along.T @ ((1.0 - 1.0 / spread)[:, None] * along)
+        step = np.linalg.lstsq(weighed[:-1, :-1], weighed[:-1, -1], rcond=TOLD_APART**2)[0]
+        variance = max(float(weighed[-1, -1] - weighed[-1, :-1] @ step), 1e-300) / count
+        return 0.5 * (count * np.log(variance) + np.sum(np.log(spread)) + count), variance, spread
 
-    largest = np.log(1.0 / max(values[0], 1e-300) ** 2)
+    largest = np.log(1.0 / max(gains[0], 1e-300) ** 2)
     best = minimize_scalar(lambda x: profiled(x)[0], bounds=(largest - 10.0, largest + 25.0), method="bounded")
-    return float(np.exp(best.x) * profiled(best.x)[1]), -float(best.fun)
+    cost, variance, spread = profiled(best.x)
+    return _Force(float(np.exp(best.x)) * variance * length, -float(cost), scaled, directions, np.sqrt(spread))
 
 
 def _likelihood_of_sensor(residual, measured) -> float:

@@ -1,0 +1,146 @@
+"""What is left of a model that lacks something, or is shaken: sums of small disturbances, of chance in size.
+
+No experiment shows how a model is wrong beyond its causes. But what is wrong passes through the model before it is
+seen: it acts somewhere, is new from part to part of a record or wanders, and the model makes of it what it makes of any
+disturbance there. So what is left in quick directions tells how much more there is in slow ones, where the unknowns and
+the causes have taken it away (the discrepancy of Kennedy & O'Hagan 2001, "Bayesian calibration of computer models",
+with the covariance that the model gives; its size by restricted maximum likelihood, Patterson & Thompson 1971).
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
+from ehsvjax.diagnosis.bench.parts import PARTS, Parts
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART
+
+# Directions of what a disturbance does below this share of the largest are rounding.
+_NEGLIGIBLE = 1e-6
+
+
+class Disturbances(NamedTuple):
+    """What disturbances do to the outputs.
+
+    Attributes:
+        responses: of each kind, to that of each part of the records, by unit.
+        unknowns: derivatives of the outputs by what is refitted: what of a disturbance these can do is not left.
+
+    """
+
+    responses: tuple[Float[np.ndarray, "part record time signal"], ...]
+    unknowns: Float[np.ndarray, "direction record time signal"]
+
+
+class Discrepancy(NamedTuple):
+    """The same of one kind, of readings that count in deviations of their noise.
+
+    Attributes:
+        responses: `[part, sample]`.
+        left: of these what the unknowns cannot do.
+        noise_products: covariance of the noise's products with what is left of each.
+
+    """
+
+    responses: Float[np.ndarray, "part sample"]
+    left: Float[np.ndarray, "part sample"]
+    noise_products: Float[np.ndarray, "part part"]
+
+    def along(
+        self, direction: Float[np.ndarray, " sample"], residual: Float[np.ndarray, " sample"]
+    ) -> tuple[float, float]:
+        """Return by how much more likely than noise alone a random disturbance is, twice the logarithm, and the
+        variance that it then gives along a direction of length one, along which the residual tells nothing.
+        """
+        from scipy.optimize import minimize_scalar
+
+        along = self.left @ direction
+        values, vectors = np.linalg.eigh(self.left @ self.left.T - np.outer(along, along))
+        told = values > _NEGLIGIBLE * max(values[-1], float(along @ along))
+        if not told.any():
+            return 0.0, 0.0
+        values, vectors = values[told], vectors[:, told] / np.sqrt(values[told])
+        squares = (vectors.T @ (self.left @ residual - along * (direction @ residual))) ** 2
+        of_noise = np.sum(vectors * (self.noise_products @ vectors), axis=0)
+
+        def deviance(log_variance):
+            of_both = of_noise + np.exp(log_variance) * values
+            return float(np.sum(np.log(of_both / of_noise) + squares / of_both - squares / of_noise))
+
+        largest = -np.log(values[-1])
+        best = minimize_scalar(deviance, bounds=(largest - 5.0, largest + 30.0), method="bounded")
+        return -float(best.fun), float(np.exp(best.x) * np.sum((self.responses @ direction) ** 2))
+
+
+def variance_along(
+    some: Sequence[Discrepancy], direction: Float[np.ndarray, " sample"], residual: Float[np.ndarray, " sample"]
+) -> float:
+    """Return the variance that random disturbances give along a direction of length one, as what is left says.
+
+    None unless one is surely more likely than noise alone; of those that are about as likely, what the one gives that
+    gives most.
+    """
+    found = [one.along(direction, residual) for one in some]
+    most = max((likelier for likelier, _ in found), default=0.0)
+    if not most > INSEPARABLE:
+        return 0.0
+    return max(variance for likelier, variance in found if likelier > most - INSEPARABLE)
+
+
+def discrepancies(
+    disturbances: Disturbances,
+    scaled: Callable[[np.ndarray], np.ndarray],
+    noise_products: Callable[[np.ndarray], np.ndarray],
+) -> tuple[Discrepancy, ...]:
+    """Return what disturbances do to readings in deviations of their noise.
+
+    Args:
+        disturbances: of which kinds.
+        scaled: `Noise.scaled`.
+        noise_products: `Noise.products`.
+
+    """
+    known = span(scaled(disturbances.unknowns))
+    found = []
+    for of_kind in disturbances.responses:
+        responses = scaled(of_kind)
+        left = responses - (responses @ known) @ known.T
+        found.append(Discrepancy(responses, left, noise_products(left)))
+    return tuple(found)
+
+
+def disturbances_of(
+    every: Iterable[Parts],
+    sensors: int,
+    unknowns: Float[np.ndarray, "direction record time signal"],
+) -> Disturbances:
+    """Return what disturbances at some places, and at each of so many sensors, do to the outputs.
+
+    Each is new in every one of `PARTS` of a record, or goes on from there.
+    """
+    responses: list[np.ndarray] = []
+    for one in every:
+        counts = np.bincount(one.of_record)
+        within = np.concatenate([np.arange(count) for count in counts])
+        part = one.of_record * PARTS + within * np.minimum(PARTS, counts)[one.of_record] // counts[one.of_record]
+        starts = np.flatnonzero(np.diff(part, prepend=-1))
+        over_each = [np.add.reduceat(one.responses, starts)]
+        if not responses:
+            inside = (np.where(one.of_sample < 0, -1, part[one.of_sample]) == part[starts, None, None])[..., None]
+            over_each += [inside * sensor for sensor in np.eye(sensors, dtype=np.float32)]
+        for new in over_each:
+            of_records = [new[one.of_record[starts] == k] for k in range(len(counts))]
+            responses += [new, np.concatenate([np.cumsum(of[::-1], axis=0)[::-1] for of in of_records])]
+    return Disturbances(tuple(responses), unknowns)
+
+
+def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
+    """Return an orthonormal basis of what the unknowns can do to first order."""
+    norms = np.linalg.norm(slopes, axis=1)
+    kept = slopes[norms > 0] / norms[norms > 0, None]
+    if not len(kept):
+        return np.zeros((slopes.shape[1], 0))
+    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
+    return vectors[:, values > TOLD_APART * values[0]]
