@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
+from ehsvjax.diagnosis.bench.evidence import probabilities
 from ehsvjax.diagnosis.bench.parts import PARTS, Parts
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART
 
@@ -56,14 +56,15 @@ class Discrepancy(NamedTuple):
         """
         from scipy.optimize import minimize_scalar
 
-        along = self.left @ direction
-        values, vectors = np.linalg.eigh(self.left @ self.left.T - np.outer(along, along))
+        along, products = self.left @ direction, self.left @ self.left.T
+        values, vectors = np.linalg.eigh(products - np.outer(along, along))
         told = values > _NEGLIGIBLE * max(values[-1], float(along @ along))
         if not told.any():
             return 0.0, 0.0
         values, vectors = values[told], vectors[:, told] / np.sqrt(values[told])
         squares = (vectors.T @ (self.left @ residual - along * (direction @ residual))) ** 2
         of_noise = np.sum(vectors * (self.noise_products @ vectors), axis=0)
+        of_noise /= np.sum(vectors * (products @ vectors), axis=0)
 
         def deviance(log_variance):
             of_both = of_noise + np.exp(log_variance) * values
@@ -79,14 +80,14 @@ def variance_along(
 ) -> float:
     """Return the variance that random disturbances give along a direction of length one, as what is left says.
 
-    None unless one is surely more likely than noise alone; of those that are about as likely, what the one gives that
-    gives most.
+    The mean over what may act, each as probable as it is likely, noise alone among them: as probable beforehand as all
+    kinds of disturbance together (Hoeting et al. 1999, "Bayesian model averaging"), each of which has a variance more.
     """
-    found = [one.along(direction, residual) for one in some]
-    most = max((likelier for likelier, _ in found), default=0.0)
-    if not most > INSEPARABLE:
+    if not some:
         return 0.0
-    return max(variance for likelier, variance in found if likelier > most - INSEPARABLE)
+    likelier, variances = zip(*[one.along(direction, residual) for one in some], strict=True)
+    price = 2.0 * np.log(len(some)) + np.log([len(one.left) for one in some])
+    return float(probabilities([0.0, *(price - likelier)])[1:] @ variances)
 
 
 def discrepancies(
@@ -126,10 +127,10 @@ def disturbances_of(
         within = np.concatenate([np.arange(count) for count in counts])
         part = one.of_record * PARTS + within * np.minimum(PARTS, counts)[one.of_record] // counts[one.of_record]
         starts = np.flatnonzero(np.diff(part, prepend=-1))
-        over_each = [np.add.reduceat(one.responses, starts)]
+        over_each = [np.add.reduceat(one.responses, starts, dtype=float)]
         if not responses:
             inside = (np.where(one.of_sample < 0, -1, part[one.of_sample]) == part[starts, None, None])[..., None]
-            over_each += [inside * sensor for sensor in np.eye(sensors, dtype=np.float32)]
+            over_each += [inside * sensor for sensor in np.eye(sensors)]
         for new in over_each:
             of_records = [new[one.of_record[starts] == k] for k in range(len(counts))]
             responses += [new, np.concatenate([np.cumsum(of[::-1], axis=0)[::-1] for of in of_records])]
