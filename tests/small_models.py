@@ -182,3 +182,45 @@ def damper() -> Model:
         measure=measure,
         max_step=0.005,
     )
+
+
+# --- A ball on a beam: y'' = g*u - d*y', which nothing holds ---
+
+
+def ball() -> Model:
+    """Return the model of a ball that rolls along a beam, from the beam's angle."""
+    return Model(
+        name="ball on a beam",
+        parameters=(
+            Parameter("gain", "g", "m/s^2", 5.0, 0.5, 50.0, "log"),
+            Parameter("damping", "d", "1/s", 0.1, 1e-3, 5.0, "log"),
+        ),
+        initial=(
+            Parameter("initial_position", "y(0)", "m", 0.0, -0.3, 0.3, output="position"),
+            Parameter("initial_velocity", "v(0)", "m/s", 0.0, -0.5, 0.5),
+        ),
+        signals=(Signal("angle", "input", "rad"), Signal("force", "force", "m/s^2"), Signal("position", "sensor", "m")),
+        start=lambda parameters, initial, inputs: {"y": initial["initial_position"], "v": initial["initial_velocity"]},
+        stepper=runge_kutta_4(_ball_rates),
+        measure=lambda parameters, state, inputs, signal: {"position": signal("position", state["y"])},
+        max_step=0.02,
+    )
+
+
+def _ball_rates(parameters, state, inputs, signal):
+    pushed = parameters["gain"] * signal("angle", inputs["angle"]) - parameters["damping"] * state["v"]
+    return {"y": state["v"], "v": pushed + signal("force", 0.0, position=state["y"], velocity=state["v"])}
+
+
+def shaken_ball(angle, period, density, rng, *, gain=5.0, damping=0.5, stiffness=0.0, steps=10) -> np.ndarray:
+    """Return the motion of a ball under a white random force of some spectral density, (m/s^2)^2 s, in small steps."""
+    step = period / steps
+    position = velocity = 0.0
+    found = np.zeros(len(angle))
+    for k, held in enumerate(angle):
+        found[k] = position
+        for force in rng.normal(0.0, np.sqrt(density / step), steps):
+            acceleration = gain * held - damping * velocity - stiffness * position + force
+            position += step * velocity + 0.5 * step**2 * acceleration
+            velocity += step * acceleration
+    return found

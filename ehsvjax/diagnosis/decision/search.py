@@ -31,7 +31,7 @@ from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, response
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
 _ROUNDS = 6
-# Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
+# Deficit of rivals whose arithmetic a verdict stands on.
 _WEIGHED = 25.0
 
 
@@ -54,8 +54,8 @@ class Integration(NamedTuple):
     Attributes:
         step_size: s.
         left_out: output -> readings beside a jump, which no such step knows or no unknown places: they carry no weight.
-        worth: variances of what is left by which halving the step changes the difference of any two explanations' sums
-            of squares, at most; of what is more than 25 behind, in twenty-fifths of that.
+        worth: by how much halving the step changes what the explanation gains over any other that it is compared with,
+            at most, as `Noise.gained` counts.
 
     """
 
@@ -183,7 +183,7 @@ class _Weighed(NamedTuple):
         needs: for each cause what the fit needs it for.
         unused: what is left of unused data with all causes, without each of them, and without any.
         needless: the cause that is needed least, if the record can do without it.
-        worth: variances of what is left by which halving the step changes the difference of any two of them.
+        worth: by how much halving the step changes what they gain over any of them.
 
     """
 
@@ -216,21 +216,18 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
 
 
 def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
-    """Return the bench settled for all explanations that are compared, and what arithmetic is worth between them.
-
-    The first is the best, and no difference counts for more than what it leaves. Where another is far behind, its
-    arithmetic counts as a part of that.
+    """Return the bench settled for the best of all explanations that are compared, the first, and what arithmetic is
+    worth between it and any other: by how much half the step changes what the one gains over the other.
     """
-    outputs_at, readings = bench.stepped(points), bench.problem.samples.outputs
-    excess = noise.excess(readings - outputs_at(int(bench.problem.substeps))[0])
-    known = settled(bench, outputs_at, noise.innovation_variances * excess)
+    readings = bench.problem.samples.outputs
+    best = bench.stepped(points[:1])
+    excess = noise.excess(readings - best(int(bench.problem.substeps))[0])
+    known = settled(bench, best, noise.innovation_variances * excess)
     here = int(known.problem.substeps)
-    coarse, fine = (
-        np.sum(noise.scaled((readings - outputs_at(substeps)) / np.sqrt(excess)[:, None]) ** 2, axis=-1)
-        for substeps in (here, 2 * here)
+    coarse, fine = (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
+    worth = max(
+        abs(noise.gained(two, fine[0]) - noise.gained(one, coarse[0])) for one, two in zip(coarse, fine, strict=True)
     )
-    behind = np.maximum(1.0, (fine - fine[0]) / _WEIGHED)
-    worth = float(np.max(np.abs((fine - coarse) - (fine - coarse)[0]) / behind))
     if known is bench and worth > 1.0 and not finest(known.problem):
         return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
     return known, worth
