@@ -14,6 +14,7 @@ from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
+from ehsvjax.diagnosis.decision.rivals import Rival, rivals_again
 from ehsvjax.diagnosis.decision.search import _look, _weighed
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
@@ -194,6 +195,18 @@ def test_a_single_cause_that_the_record_can_do_without_is_needless(bench):
     nominal, found = (refit_sets(trials, [[bench.nominal]], [some], noise) for some in ((), (cause,)))
     weighed = _weighed(_look(trials, (cause,), found, noise), nominal)
     assert weighed.stage.included == (weighed.needless,), weighed.needs
+
+
+def test_what_has_taken_one_causes_place_is_no_rival_of_another(bench):
+    """Else an explanation has it twice, and no such model can be made."""
+    names = [c.name for c in bench.candidates]
+    one, other = names.index("cubic_stiffness"), names.index("rayleigh_damping")
+    trials = trials_of(bench, lambda stage: None)
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    both = refit_sets(trials, [[bench.nominal]], [(one, other)], noise)
+    groups = ((Rival(one, 0.0, both), Rival(other, 1.0, both)), (Rival(other, 0.0, both), Rival(one, 1.0, both)))
+    included, _, found = rivals_again(trials, (one, other), both, groups, noise)
+    assert [[rival.candidate for rival in group] for group in found] == [[cause] for cause in included]
 
 
 def test_sketches_follow_a_model_to_where_it_is_stiff():

@@ -324,10 +324,11 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
         penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
-        # While other causes are missing, what differs from part to part is theirs: the last look judges it (`_needs`).
+        # While other causes are missing, what is left is theirs as well: the last look judges it (`_needs`).
+        alone = replace(stage.noise, disturbances=None)
         enough = [
             np.isfinite(cost)
-            and stage.noise.in_variances(
+            and alone.in_variances(
                 float(stage.current.cost[0] - cost), stage.current.residual[0], residual
             )[0] > required_gain(bench, stage.screening, s.candidate)
             for s, cost, residual in zip(some, refitted.cost, refitted.residual, strict=True)
