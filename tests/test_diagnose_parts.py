@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
-from ehsvjax.diagnosis.bench.discrepancy import disturbances_of
+from ehsvjax.diagnosis.bench.discrepancy import Disturbances, kinds_of
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, corrected, probabilities, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.parts import Parts
@@ -371,17 +371,17 @@ def test_misfit_that_lasts_counts_once_however_short_the_parts_are(monkeypatch):
     """Misfit that returns within 150 samples, and a direction of a few strokes that has no part in it."""
     direction = np.sign(np.sin(np.linspace(0.0, 4.0 * np.pi, 2000)))
     rng, decay = np.random.default_rng(2), np.exp(-1.0 / 150.0)
-    slow = lfilter([1.0], [1.0, -decay], rng.standard_normal((4000, 2750)))[:, 750:]
+    slow = lfilter([1.0], [1.0, -decay], rng.standard_normal((2000, 2750)))[:, 750:]
     misfit = 5.0 * np.sqrt(1.0 - decay**2) * slow + rng.standard_normal(slow.shape)
     left = misfit - np.outer(misfit @ direction, direction) / (direction @ direction)
-    # A model that does nothing with what disturbs it: all that lasts is the sensor's.
-    nothing = Parts("force", (np.arange(2000) // 10)[None], np.zeros(200, int), 1.0, np.zeros((200, 1, 2000, 1)))
     for parts in (20, 40):
         monkeypatch.setattr("ehsvjax.diagnosis.bench.noise.PARTS", parts)
-        monkeypatch.setattr("ehsvjax.diagnosis.bench.discrepancy.PARTS", parts)
+        # A model that does nothing with what disturbs it: all that lasts is the sensor's.
+        of_sample = (np.arange(2000) * parts // 2000)[None]
+        nothing = Parts("force", of_sample, np.zeros(parts, int), 1.0, np.zeros((parts, 1, 2000, 1)))
         noise = replace(
             plain_noise(np.array([1.0]), np.ones((1, 2000, 1), bool)),
-            disturbances=disturbances_of([nothing], 1, np.zeros((1, 1, 2000, 1))),
+            disturbances=Disturbances(kinds_of([nothing], 1), np.zeros((1, 1, 2000, 1))),
         )
         gains = np.array([noise.gained(series(a), series(b)) for a, b in zip(misfit, left, strict=True)])
         # A likelihood ratio of a few strokes is not quite a chi square (4 and 10% of many draws); taken one by one the

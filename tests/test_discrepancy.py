@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 import ehsvjax
-from ehsvjax.diagnosis.bench.discrepancy import disturbances_of
+from ehsvjax.diagnosis.bench.discrepancy import Disturbances, kinds_of
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
@@ -33,10 +33,10 @@ def outside(known, series):
 def test_what_a_random_force_moves_counts_by_what_it_gives_where_the_unknowns_left_nothing_of_it():
     """Gains of directions that have no part in what is left are as large as chance makes them, and no larger."""
     rng = np.random.default_rng(0)
-    time, count = PERIOD * np.arange(SAMPLES), SAMPLES // 8
-    of_sample = np.minimum(np.arange(SAMPLES) // 8, count - 1)
+    time, count = PERIOD * np.arange(SAMPLES), SAMPLES // 16
+    of_sample = np.minimum(np.arange(SAMPLES) // 16, count - 1)
     responses = np.stack([rolled((of_sample == k).astype(float)) for k in range(count)])
-    parts = Parts("force", of_sample[None], np.zeros(count, int), 8 * PERIOD, responses[:, None, :, None])
+    parts = Parts("force", of_sample[None], np.zeros(count, int), 16 * PERIOD, responses[:, None, :, None])
     measured = np.ones((1, SAMPLES, 1), bool)
     gains = {"noise alone": [], "and disturbances": []}
     for _ in range(60):
@@ -44,7 +44,7 @@ def test_what_a_random_force_moves_counts_by_what_it_gives_where_the_unknowns_le
         known = np.stack([np.ones(SAMPLES), time, rolled(5.0 * angle)])
         left = outside(known, rolled(rng.normal(0.0, 0.04, SAMPLES)) + rng.normal(0.0, NOISE, SAMPLES))
         noises = {"noise alone": plain_noise(np.array([NOISE**2]), measured)}
-        disturbances = disturbances_of([parts], 1, known[:, None, :, None])
+        disturbances = Disturbances(kinds_of([parts], 1), known[:, None, :, None])
         noises["and disturbances"] = replace(noises["noise alone"], disturbances=disturbances)
         for force in (np.ones(SAMPLES), rolled(angle), np.sign(angle), np.sin(time / 2.0), np.abs(rolled(angle))):
             direction = outside(known, rolled(force))
@@ -67,6 +67,7 @@ def diagnosed(seed, density, samples=SAMPLES, **plant):
     return ehsvjax.diagnose(fit, record, key=jax.random.key(1))
 
 
+@pytest.mark.thorough
 def test_a_random_force_on_what_nothing_holds_is_chance_and_no_cause():
     """Of many, see benchmarks/shaken.py."""
     diagnosis = diagnosed(0, 1.6e-4)

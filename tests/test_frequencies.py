@@ -6,7 +6,6 @@ import pytest
 
 import ehsvjax
 from ehsvjax.diagnosis.bench.noise import plain_noise
-from ehsvjax.diagnosis.bench.parts import parts_at
 from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.hypotheses.harmonics import _of_inputs, period_of, waves_of, with_frequencies
@@ -39,7 +38,7 @@ def bench_of(fit, readings):
 
 def test_parts_of_a_force_add_up_to_what_a_sine_does_to_the_plant(fit):
     bench = bench_of(fit, position())
-    parts = parts_at(bench, bench.nominal, "force")
+    parts = waves_of(bench)["harmonic_force"].parts
     amplitude, frequency, phase = 1e-4, 1.37, 0.4
     sine = {"force": amplitude, "frequency": frequency, "phase": phase}
     expected = position(harmonic_force=sine) - position()
@@ -62,8 +61,7 @@ def test_the_frequency_of_what_is_there_is_among_those_that_are_tried(fit, effec
     bench = bench_of(fit, position(**{effect: sizes}) + noise)
     noise = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
     current = refit(bench, bench.nominal[None], padded([bench.base_columns], len(bench.base_columns)), noise)
-    waves = waves_of(bench, {"force": parts_at(bench, bench.nominal, "force")})
-    tried = with_frequencies(bench, current, noise, waves).scales[effect]["frequencies"]
+    tried = with_frequencies(bench, current, noise, waves_of(bench)).scales[effect]["frequencies"]
     resolution = 2.0 * np.pi / (SAMPLES * PERIOD)
     assert min(abs(frequency - sizes["frequency"]) for frequency in tried) < 0.5 * resolution
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.evidence import probabilities
-from ehsvjax.diagnosis.bench.parts import PARTS, Parts
+from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART
 
 # Directions of what a disturbance does below this share of the largest are rounding.
@@ -112,29 +112,26 @@ def discrepancies(
     return tuple(found)
 
 
-def disturbances_of(
-    every: Iterable[Parts],
-    sensors: int,
-    unknowns: Float[np.ndarray, "direction record time signal"],
-) -> Disturbances:
+def kinds_of(every: Iterable[Parts], sensors: int) -> tuple[Float[np.ndarray, "part record time signal"], ...]:
     """Return what disturbances at some places, and at each of so many sensors, do to the outputs.
 
-    Each is new in every one of `PARTS` of a record, or goes on from there.
+    Each is new in every part of a record, or goes on from there.
+
+    Args:
+        every: what one over each of the same parts does, of each place.
+        sensors: whose readings it may be.
+
     """
     responses: list[np.ndarray] = []
     for one in every:
-        counts = np.bincount(one.of_record)
-        within = np.concatenate([np.arange(count) for count in counts])
-        part = one.of_record * PARTS + within * np.minimum(PARTS, counts)[one.of_record] // counts[one.of_record]
-        starts = np.flatnonzero(np.diff(part, prepend=-1))
-        over_each = [np.add.reduceat(one.responses, starts, dtype=float)]
+        over_each = [one.responses.astype(float)]
         if not responses:
-            inside = (np.where(one.of_sample < 0, -1, part[one.of_sample]) == part[starts, None, None])[..., None]
-            over_each += [inside * sensor for sensor in np.eye(sensors)]
+            inside = one.of_sample == np.arange(len(one.of_record))[:, None, None]
+            over_each += [inside[..., None] * sensor for sensor in np.eye(sensors)]
         for new in over_each:
-            of_records = [new[one.of_record[starts] == k] for k in range(len(counts))]
+            of_records = [new[one.of_record == k] for k in np.unique(one.of_record)]
             responses += [new, np.concatenate([np.cumsum(of[::-1], axis=0)[::-1] for of in of_records])]
-    return Disturbances(tuple(responses), unknowns)
+    return tuple(responses)
 
 
 def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:

@@ -9,8 +9,8 @@ from ehsvjax.diagnosis.bench.workbench import Workbench
 
 PARTS = 20
 """Of a record, between which what is left of it may differ."""
-# The parts in which what is known of one is simulated.
-_PARTS = 200
+FINE = 200
+"""Of a record, for what is quicker."""
 _LEAST_SAMPLES = 2
 
 
@@ -40,12 +40,12 @@ class Parts(NamedTuple):
         return np.add.reduceat(series[..., inside], first, axis=-1) / np.bincount(which)
 
 
-def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: str) -> Parts:
-    """Simulate a small disturbance over each part of the records at one of the workbench's places."""
+def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: str, most: int = FINE) -> Parts:
+    """Simulate a small disturbance over each of at most so many parts of the records at one of the bench's places."""
     lengths = bench.present.sum(axis=1)
     durations = lengths * bench.problem.samples.sample_period
     # As long in every record.
-    length = float(np.max(durations / np.minimum(_PARTS, lengths // _LEAST_SAMPLES)))
+    length = float(np.max(durations / np.minimum(most, lengths // _LEAST_SAMPLES)))
     counts = np.maximum(np.round(durations / length).astype(int), 1)
     within = np.where(bench.present, np.arange(bench.present.shape[1]) * counts[:, None] // lengths[:, None], -1)
     # What acts in one record does nothing in the others: a part of each is simulated at once.

@@ -83,12 +83,8 @@ def rivals_again(
             included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
             break
     # What has taken one cause's place is no rival of another.
-    others = [set(included) - {group[0].candidate} for group in ranked]
-    return (
-        included,
-        final,
-        tuple(tuple(r for r in group if r.candidate not in other) for group, other in zip(ranked, others, strict=True)),
-    )
+    of_each = [tuple(r for r in group if r.candidate not in included or r is group[0]) for group in ranked]
+    return included, final, tuple(of_each)
 
 
 def _refitted_beside(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
-from ehsvjax.diagnosis.bench.discrepancy import disturbances_of
+from ehsvjax.diagnosis.bench.discrepancy import Disturbances
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
@@ -31,7 +31,7 @@ from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, response
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
 _ROUNDS = 6
-# Deficit of rivals whose arithmetic a verdict stands on.
+# Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
 _WEIGHED = 25.0
 
 
@@ -55,7 +55,7 @@ class Integration(NamedTuple):
         step_size: s.
         left_out: output -> readings beside a jump, which no such step knows or no unknown places: they carry no weight.
         worth: by how much halving the step changes what the explanation gains over any other that it is compared with,
-            at most, as `Noise.gained` counts.
+            at most, as `Noise.gained` counts; of what is more than 25 behind, in twenty-fifths of that.
 
     """
 
@@ -218,16 +218,19 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
 def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
     """Return the bench settled for the best of all explanations that are compared, the first, and what arithmetic is
     worth between it and any other: by how much half the step changes what the one gains over the other.
+
+    Where another is far behind, its arithmetic counts as a part of that.
     """
     readings = bench.problem.samples.outputs
     best = bench.stepped(points[:1])
     excess = noise.excess(readings - best(int(bench.problem.substeps))[0])
     known = settled(bench, best, noise.innovation_variances * excess)
     here = int(known.problem.substeps)
-    coarse, fine = (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
-    worth = max(
-        abs(noise.gained(two, fine[0]) - noise.gained(one, coarse[0])) for one, two in zip(coarse, fine, strict=True)
+    coarse, fine = (
+        np.array([noise.gained(left, every[0]) for left in every])
+        for every in (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
     )
+    worth = float(np.max(np.abs(fine - coarse) / np.maximum(1.0, np.abs(fine) / _WEIGHED)))
     if known is bench and worth > 1.0 and not finest(known.problem):
         return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
     return known, worth
@@ -269,7 +272,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
         spanned = current.slopes[0], tried.changes, trials.terms.responses
         noise = replace(
             noise_outside(current.residual[0], measured, spanned),
-            disturbances=disturbances_of(trials.parts.values(), measured.shape[-1], current.slopes[0]),
+            disturbances=Disturbances(trials.disturbances, current.slopes[0]),
         )
         before = trials
         trials, current = _known(before, included, current, noise)

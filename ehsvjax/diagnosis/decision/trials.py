@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnosis.bench.discrepancy import span
+from ehsvjax.diagnosis.bench.discrepancy import kinds_of, span
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.parts import Parts, parts_at
+from ehsvjax.diagnosis.bench.parts import PARTS, parts_at
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
@@ -36,7 +36,7 @@ class Trials(NamedTuple):
         bench: the workbench.
         seen: what runs along the nominal model and varies, by name.
         terms: of free form, at all places, and what they would do to the outputs of the nominal model.
-        parts: of the records, and what a disturbance over each does, by the signal that is disturbed.
+        disturbances: what those of the model's signals and of its sensors do to the outputs.
         waves: what harmonic effects would do, by the candidate's name.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
@@ -46,7 +46,7 @@ class Trials(NamedTuple):
     bench: Workbench
     seen: dict[str, Float[np.ndarray, "record time"]]
     terms: Terms
-    parts: dict[str, Parts]
+    disturbances: tuple[Float[np.ndarray, "part record time signal"], ...]
     waves: dict[str, Waves]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Progress
@@ -56,8 +56,9 @@ def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
     terms = terms_at(bench, bench.nominal, every_curve(bench, seen))
-    parts = {place: parts_at(bench, bench.nominal, place) for place in bench.places}
-    return Trials(bench, seen, terms, parts, waves_of(bench, parts), {}, progress)
+    parts = [parts_at(bench, bench.nominal, place, PARTS) for place in bench.places]
+    disturbances = kinds_of(parts, len(bench.problem.observed))
+    return Trials(bench, seen, terms, disturbances, waves_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:

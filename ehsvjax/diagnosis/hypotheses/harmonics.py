@@ -5,7 +5,6 @@ simulated once only. Frequencies too high for the parts are looked for in the re
 themselves, their own frequency and its multiples are left out: what goes by them a nonlinear model makes of its inputs.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.parts import Parts
+from ehsvjax.diagnosis.bench.parts import Parts, parts_at
 from ehsvjax.diagnosis.bench.refits import Refits, unexplained
 from ehsvjax.diagnosis.bench.workbench import AT_ONCE, Workbench, duration_of
 from ehsvjax.effects.effect import Candidate, Scales
@@ -48,10 +47,12 @@ class Waves(NamedTuple):
     shares: Float[np.ndarray, "frequency amplitude part"]
 
 
-def waves_of(bench: Workbench, parts: Mapping[str, Parts]) -> dict[str, Waves]:
+def waves_of(bench: Workbench) -> dict[str, Waves]:
     """Return the waves of every harmonic effect whose sum of parts is known, by the candidate's name."""
+    some = [c for c in bench.candidates if _by_parts(bench, c)]
+    parts = {place: parts_at(bench, bench.nominal, place) for place in dict.fromkeys(c.signal for c in some)}
     found = {}
-    for candidate in filter(functools.partial(_by_parts, bench), bench.candidates):
+    for candidate in some:
         there = parts[candidate.signal]
         lowest, highest = _range_of(bench, candidate)
         edge = min(highest, 2.0 * np.pi * _PERIODS_PER_PART / there.length)
