@@ -62,8 +62,7 @@ def worth(angle, trial: Trial) -> float:
     In variances of what is of chance: the sensor's noise and what a force does that is held from sample to sample.
     """
 
-    def moved(angle, step=0.0, **plant):
-        # Without chance, but for a force over one sample.
+    def moved(angle, **plant):
         return shaken_ball(angle, PERIOD, 0.0, np.random.default_rng(0), **plant)
 
     count, plant = len(angle), {"gain": 5.0, "damping": 0.5, "stiffness": trial.stiffness}
@@ -113,13 +112,11 @@ def _tried(trial: Trial) -> dict[str, Any]:
 def outcome(row: Mapping[Any, Any]) -> str:
     """Return what an answer was: of a group that holds the spring nothing is wrong."""
     named = set(row["causes"]) - {PROCESS_NOISE, UNKNOWN}
-    if not row["stiffness"]:
-        return "a false name" if named else "chance" if PROCESS_NOISE in row["causes"] else row["verdict"]
-    if named == {SPRING}:
-        return "named" if SPRING not in row["groups"] else "in a group"
-    if len(named) == 1 and SPRING in row["groups"]:
+    if not named:
+        return "chance" if PROCESS_NOISE in row["causes"] else row["verdict"]
+    if row["stiffness"] and len(named) == 1 and SPRING in row["groups"]:
         return "in a group"
-    return "a false name" if named else "chance" if PROCESS_NOISE in row["causes"] else row["verdict"]
+    return "named" if row["stiffness"] and named == {SPRING} else "a false name"
 
 
 def main() -> None:

@@ -371,7 +371,7 @@ def test_misfit_that_lasts_counts_once_however_short_the_parts_are(monkeypatch):
     """Misfit that returns within 150 samples, and a direction of a few strokes that has no part in it."""
     direction = np.sign(np.sin(np.linspace(0.0, 4.0 * np.pi, 2000)))
     rng, decay = np.random.default_rng(2), np.exp(-1.0 / 150.0)
-    slow = lfilter([1.0], [1.0, -decay], rng.standard_normal((2000, 2750)))[:, 750:]
+    slow = lfilter([1.0], [1.0, -decay], rng.standard_normal((4000, 2750)))[:, 750:]
     misfit = 5.0 * np.sqrt(1.0 - decay**2) * slow + rng.standard_normal(slow.shape)
     left = misfit - np.outer(misfit @ direction, direction) / (direction @ direction)
     for parts in (20, 40):

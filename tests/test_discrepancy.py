@@ -34,7 +34,7 @@ def test_what_a_random_force_moves_counts_by_what_it_gives_where_the_unknowns_le
     """Gains of directions that have no part in what is left are as large as chance makes them, and no larger."""
     rng = np.random.default_rng(0)
     time, count = PERIOD * np.arange(SAMPLES), SAMPLES // 16
-    of_sample = np.minimum(np.arange(SAMPLES) // 16, count - 1)
+    of_sample = np.arange(SAMPLES) // 16
     responses = np.stack([rolled((of_sample == k).astype(float)) for k in range(count)])
     parts = Parts("force", of_sample[None], np.zeros(count, int), 16 * PERIOD, responses[:, None, :, None])
     measured = np.ones((1, SAMPLES, 1), bool)

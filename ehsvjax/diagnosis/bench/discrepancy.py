@@ -40,12 +40,14 @@ class Discrepancy(NamedTuple):
     Attributes:
         responses: `[part, sample]`.
         left: of these what the unknowns cannot do.
-        noise_products: covariance of the noise's products with what is left of each.
+        products: of what is left of each.
+        noise_products: covariance of the noise's products with it.
 
     """
 
     responses: Float[np.ndarray, "part sample"]
     left: Float[np.ndarray, "part sample"]
+    products: Float[np.ndarray, "part part"]
     noise_products: Float[np.ndarray, "part part"]
 
     def along(
@@ -56,15 +58,15 @@ class Discrepancy(NamedTuple):
         """
         from scipy.optimize import minimize_scalar
 
-        along, products = self.left @ direction, self.left @ self.left.T
-        values, vectors = np.linalg.eigh(products - np.outer(along, along))
+        along = self.left @ direction
+        values, vectors = np.linalg.eigh(self.products - np.outer(along, along))
         told = values > _NEGLIGIBLE * max(values[-1], float(along @ along))
         if not told.any():
             return 0.0, 0.0
         values, vectors = values[told], vectors[:, told] / np.sqrt(values[told])
         squares = (vectors.T @ (self.left @ residual - along * (direction @ residual))) ** 2
         of_noise = np.sum(vectors * (self.noise_products @ vectors), axis=0)
-        of_noise /= np.sum(vectors * (products @ vectors), axis=0)
+        of_noise /= np.sum(vectors * (self.products @ vectors), axis=0)
 
         def deviance(log_variance):
             of_both = of_noise + np.exp(log_variance) * values
@@ -108,7 +110,7 @@ def discrepancies(
     for of_kind in disturbances.responses:
         responses = scaled(of_kind)
         left = responses - (responses @ known) @ known.T
-        found.append(Discrepancy(responses, left, noise_products(left)))
+        found.append(Discrepancy(responses, left, left @ left.T, noise_products(left)))
     return tuple(found)
 
 

@@ -127,11 +127,9 @@ class Noise:
     ) -> tuple[float, float]:
         """Return the variance of what an explanation leaves, along a direction, and of how many parts it is known.
 
-        That of the noise, which is known, or, if it is more and not by chance, as it differs from part to part of the
-        records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Misfit
-        lasts: parts that are like their neighbours, and not by chance, count as a first-order autoregression's do
-        (Andrews & Monahan 1992, "An improved heteroskedasticity and autocorrelation consistent covariance matrix
-        estimator"), so that the variance is no other with shorter parts. Both arguments are of scaled readings.
+        That of the noise, which is known, and of what disturbances give (`discrepancy`); or, if it is more and not by
+        chance, as it differs from part to part of the records: of a sum of squares of as many independent parts as the
+        direction lies in (Satterthwaite 1946). Both arguments are of scaled readings.
         """
         from scipy.special import chdtrc
 
@@ -157,6 +155,8 @@ class Noise:
 
     def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
         """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""
+        if not self.coloured:
+            return 1.0
         flat = directions.reshape(-1, directions.shape[-1])
         return float(np.trace(self.products(flat)) / np.sum(flat**2))
 

@@ -9,8 +9,8 @@ from ehsvjax.diagnosis.bench.workbench import Workbench
 
 PARTS = 20
 """Of a record, between which what is left of it may differ."""
-FINE = 200
-"""Of a record, for what is quicker."""
+# Of a record, for what is quicker.
+_FINE = 200
 _LEAST_SAMPLES = 2
 
 
@@ -40,7 +40,7 @@ class Parts(NamedTuple):
         return np.add.reduceat(series[..., inside], first, axis=-1) / np.bincount(which)
 
 
-def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: str, most: int = FINE) -> Parts:
+def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: str, most: int = _FINE) -> Parts:
     """Simulate a small disturbance over each of at most so many parts of the records at one of the bench's places."""
     lengths = bench.present.sum(axis=1)
     durations = lengths * bench.problem.samples.sample_period
