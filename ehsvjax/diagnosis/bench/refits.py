@@ -71,6 +71,17 @@ def unexplained(
     return known, residual - known @ (known.T @ residual)
 
 
+def not_made_up_for(
+    change: Float[np.ndarray, "record time signal"], refitted: Refits, weigh: Callable[[np.ndarray], np.ndarray]
+) -> Float[np.ndarray, "record time signal"]:
+    """Return what of a change of the outputs the unknowns of one refit cannot make up for, to first order."""
+    slopes = weigh(refitted.slopes[0]).T
+    norms = np.linalg.norm(slopes, axis=0)
+    norms[norms == 0.0] = 1.0
+    amounts = np.linalg.lstsq(slopes / norms, weigh(change), rcond=TOLD_APART)[0]
+    return change - np.tensordot(amounts / norms, refitted.slopes[0], 1)
+
+
 def noise_of_all_left(bench: Workbench, final: Refits) -> Noise:
     """Return the noise of a refit's residual, if all that is left of it is noise."""
     return noise_outside(final.residual[0], bench.problem.samples.measured, [final.slopes[0]])

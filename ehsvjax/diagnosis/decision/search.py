@@ -13,7 +13,7 @@ from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICAN
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.progress import Progress
-from ehsvjax.diagnosis.bench.refits import Refits
+from ehsvjax.diagnosis.bench.refits import Refits, not_made_up_for
 from ehsvjax.diagnosis.bench.workbench import Workbench, prepared, settled
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
@@ -215,25 +215,35 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     return _Weighed(stage, nominal, rivals, needs, unused, _needless(included, needs, unused), worth)
 
 
-def _settled_for_all(bench: Workbench, points, noise: Noise) -> tuple[Workbench, float]:
+def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise) -> tuple[Workbench, float]:
     """Return the bench settled for the best of all explanations that are compared, the first, and what arithmetic is
-    worth between it and any other: by how much half the step changes what the one gains over the other.
+    worth between it and any other: by how much half the step changes what the one gains over the other, once the
+    unknowns of both have followed.
 
     Where another is far behind, its arithmetic counts as a part of that.
     """
     readings = bench.problem.samples.outputs
-    best = bench.stepped(points[:1])
-    excess = noise.excess(readings - best(int(bench.problem.substeps))[0])
-    known = settled(bench, best, noise.innovation_variances * excess)
+    known = _settled(bench, compared[0], noise)
     here = int(known.problem.substeps)
-    coarse, fine = (
-        np.array([noise.gained(left, every[0]) for left in every])
-        for every in (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
-    )
-    worth = float(np.max(np.abs(fine - coarse) / np.maximum(1.0, np.abs(fine) / _WEIGHED)))
+    points = np.concatenate([refitted.points for refitted in compared])
+    coarse, fine = (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
+    fine = coarse + np.stack([not_made_up_for(*each, noise.scaled) for each in zip(fine - coarse, compared, strict=True)])
+    before, after = (np.array([noise.gained(left, every[0]) for left in every]) for every in (coarse, fine))
+    worth = float(np.max(np.abs(after - before) / np.maximum(1.0, np.abs(after) / _WEIGHED)))
     if known is bench and worth > 1.0 and not finest(known.problem):
         return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
     return known, worth
+
+
+def _settled(bench: Workbench, refitted: Refits, noise: Noise) -> Workbench:
+    """Return the bench settled for one explanation: as any change of the outputs, what its arithmetic makes of them
+    counts in variances of what is left along it.
+    """
+    outputs_at, here = bench.stepped(refitted.points), int(bench.problem.substeps)
+    off = noise.scaled(outputs_at(2 * here)[0] - outputs_at(here)[0])
+    left = noise.scaled(bench.problem.samples.outputs - outputs_at(here)[0])
+    variance, _ = noise.left_along(off, left) if 0.0 < float(off @ off) < np.inf else (1.0, np.inf)
+    return settled(bench, outputs_at, noise.variances * variance)
 
 
 def _integration(begun: Workbench, ended: Workbench, worth: float) -> Integration:
@@ -247,10 +257,9 @@ def _integration(begun: Workbench, ended: Workbench, worth: float) -> Integratio
     )
 
 
-def _compared(final: Refits, nominal: Refits, rivals: Sequence[Sequence[Rival]]) -> Float[np.ndarray, "individual _"]:
-    """Return the points of all explanations that a verdict weighs against each other."""
-    close = [r.refitted.points for group in rivals for r in group if r.deficit < _WEIGHED]
-    return np.concatenate([final.points, nominal.points, *close])
+def _compared(final: Refits, nominal: Refits, rivals: Sequence[Sequence[Rival]]) -> list[Refits]:
+    """Return the refits of all explanations that a verdict weighs against each other."""
+    return [final, nominal, *(r.refitted for group in rivals for r in group if r.deficit < _WEIGHED)]
 
 
 def required_gain(bench: Workbench, screening: Screening, candidate: int) -> float:
@@ -291,8 +300,7 @@ def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: No
     """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
     while True:
         bench = trials.bench
-        variances = noise.innovation_variances * noise.excess(current.residual[0])
-        known = without_jumps(settled(bench, bench.stepped(current.points), variances), current, noise)
+        known = without_jumps(_settled(bench, current, noise), current, noise)
         if known is bench:
             return trials, current
         trials = trials._replace(bench=known)
