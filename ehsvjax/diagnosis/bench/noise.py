@@ -5,14 +5,12 @@ that noise is judged by what is left of the residual outside that space: a model
 noise, nor coloured noise for a misfit.
 """
 
-import functools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ehsvjax.diagnosis.bench.discrepancy import Discrepancy, Disturbances, discrepancies, variance_along
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.bench.parts import PARTS
 from ehsvjax.precision.residual_noise import (
@@ -27,10 +25,11 @@ _NEGLIGIBLE = 1e-3
 # Rounds of an estimate of coloured noise at most, the share by which the last one changes it, and the share of the
 # change before that each may have.
 _ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
+# Standard errors of the correlation of neighbouring parts that chance seldom exceeds (one-sided, 10%).
+_LASTS = 1.28
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
+class Noise(NamedTuple):
     """What a model leaves if it is right: of each output in each record, white or an autoregression.
 
     Refits are by least squares, which no noise deceives; what differs between two of them counts in the variance of
@@ -39,13 +38,11 @@ class Noise:
     Attributes:
         of: `[record][signal]` the noise of each output, in its unit.
         measured: `[record, time, signal]` readings that count.
-        disturbances: of which what is left of a model that lacks something looks like sums; None for noise alone.
 
     """
 
     of: tuple[tuple[ResidualNoise, ...], ...]
     measured: Bool[np.ndarray, "record time signal"]
-    disturbances: Disturbances | None = None
 
     def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
         """Return the readings that count in deviations of the noise, one output after the other."""
@@ -127,50 +124,45 @@ class Noise:
     ) -> tuple[float, float]:
         """Return the variance of what an explanation leaves, along a direction, and of how many parts it is known.
 
-        That of the noise, which is known, and of what disturbances give (`discrepancy`); or, if it is more and not by
-        chance, as it differs from part to part of the records: of a sum of squares of as many independent parts as the
-        direction lies in (Satterthwaite 1946). Both arguments are of scaled readings.
+        That of the noise, which is known, or, if it is more and not by chance, as it differs from part to part of the
+        records: of a sum of squares of as many independent parts as the direction lies in (Satterthwaite 1946). Misfit
+        lasts: parts that are like their neighbours, and not by chance, count as a first-order autoregression's do
+        (Andrews & Monahan 1992, "An improved heteroskedasticity and autocorrelation consistent covariance matrix
+        estimator"), so that the variance is no other with shorter parts. Both arguments are of scaled readings.
         """
         from scipy.special import chdtrc
 
+        of_noise = self.along(direction)
         part_of, squares = self._part_of, float(direction @ direction)
-        expected = self.along(direction) + variance_along(self._discrepancies, direction / np.sqrt(squares), left)
         shares = np.bincount(part_of, direction**2) / squares
         parts = 1.0 / float(shares @ shares)
         sums = np.bincount(part_of, direction * left, minlength=PARTS * len(self.measured)).reshape(-1, PARTS)
         own = float(np.sum(sums**2))
         between = own / squares
-        if not chdtrc(parts, parts * between / expected) < SIGNIFICANT:
-            return expected, np.inf
+        if not chdtrc(parts, parts * between / of_noise) < SIGNIFICANT:
+            return of_noise, np.inf
+        alike = float(np.sum(sums[:, 1:] * sums[:, :-1])) / own
+        if alike * np.sqrt(parts) > _LASTS:
+            between *= min((1.0 + alike) / (1.0 - alike), parts)
         return between, parts
-
-    @functools.cached_property
-    def _discrepancies(self) -> tuple[Discrepancy, ...]:
-        return () if self.disturbances is None else discrepancies(self.disturbances, self.scaled, self.products)
 
     def of_record(self, record: int) -> "Noise":
         """Return the noise with the readings of one record alone."""
         there = np.arange(len(self.measured)) == record
-        return replace(self, measured=self.measured & there[:, None, None])
+        return self._replace(measured=self.measured & there[:, None, None])
 
     def along(self, directions: Float[np.ndarray, "*direction sample"]) -> float:
         """Return the variance of scaled noise along directions of scaled readings, their mean: one for white noise."""
         if not self.coloured:
             return 1.0
         flat = directions.reshape(-1, directions.shape[-1])
-        return float(np.trace(self.products(flat)) / np.sum(flat**2))
-
-    def products(self, directions: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "direction direction"]:
-        """Return the covariance of scaled noise's products with some directions of scaled readings."""
-        if not self.coloured:
-            return directions @ directions.T
-        series = np.zeros((*self._in_turn.shape, len(directions)))
-        series[self._in_turn] = directions.T
-        each = (
-            meat(series[i, k][None], noise) / noise.variance
+        series = np.zeros((*self._in_turn.shape, len(flat)))
+        series[self._in_turn] = flat.T
+        through = sum(
+            float(np.trace(meat(series[i, k][None], noise))) / noise.variance
             for k, of_record in enumerate(self.of) for i, noise in enumerate(of_record)
         )  # fmt: skip
-        return np.sum([*each], axis=0)
+        return through / float(np.sum(flat**2))
 
     @property
     def known(self) -> Bool[np.ndarray, "record time signal"]:
@@ -195,13 +187,6 @@ class Noise:
     def innovation_variances(self) -> Float[np.ndarray, "record signal"]:
         """Of the innovations of each output, in its unit squared: of what a sample tells alone."""
         return np.array([[noise.innovation_variance for noise in of_record] for of_record in self.of])
-
-    def excess(self, residual: Float[np.ndarray, "record time signal"]) -> Float[np.ndarray, "record signal"]:
-        """Return how many times the noise's mean square a residual has, at least one: arithmetic that is as good for
-        its size is good enough, as gains count in variances of what is left.
-        """
-        squares = np.sum(np.where(self.measured, residual, 0.0) ** 2, axis=1) / self.variances
-        return np.maximum(squares / np.maximum(self.measured.sum(axis=1), 1), 1.0)
 
     def variance_of(self, signal: int) -> float:
         """Return the variance of one output's noise, the mean over the records."""

@@ -40,12 +40,12 @@ class Parts(NamedTuple):
         return np.add.reduceat(series[..., inside], first, axis=-1) / np.bincount(which)
 
 
-def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: str, most: int = _FINE) -> Parts:
-    """Simulate a small disturbance over each of at most so many parts of the records at one of the bench's places."""
+def parts_at(bench: Workbench, point: Float[np.ndarray, " parameter"], place: str) -> Parts:
+    """Simulate a small disturbance over each part of the records at one of the workbench's places."""
     lengths = bench.present.sum(axis=1)
     durations = lengths * bench.problem.samples.sample_period
     # As long in every record.
-    length = float(np.max(durations / np.minimum(most, lengths // _LEAST_SAMPLES)))
+    length = float(np.max(durations / np.minimum(_FINE, lengths // _LEAST_SAMPLES)))
     counts = np.maximum(np.round(durations / length).astype(int), 1)
     within = np.where(bench.present, np.arange(bench.present.shape[1]) * counts[:, None] // lengths[:, None], -1)
     # What acts in one record does nothing in the others: a part of each is simulated at once.

@@ -7,7 +7,6 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ehsvjax.diagnosis.bench.discrepancy import span
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
 from ehsvjax.diagnosis.bench.workbench import ABREAST, TOLD_APART, Workbench
 
@@ -54,6 +53,16 @@ class Weighing(Protocol):
 
     def scaled(self, series: Float[np.ndarray, "*batch record time signal"]) -> Float[np.ndarray, "*batch sample"]:
         """Return the readings that count in deviations of what is of chance in them."""
+
+
+def span(slopes: Float[np.ndarray, "direction sample"]) -> Float[np.ndarray, "sample independent"]:
+    """Return an orthonormal basis of what the unknowns can do to first order."""
+    norms = np.linalg.norm(slopes, axis=1)
+    kept = slopes[norms > 0] / norms[norms > 0, None]
+    if not len(kept):
+        return np.zeros((slopes.shape[1], 0))
+    vectors, values, _ = np.linalg.svd(kept.T, full_matrices=False)
+    return vectors[:, values > TOLD_APART * values[0]]
 
 
 def unexplained(

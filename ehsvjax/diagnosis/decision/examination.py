@@ -10,8 +10,8 @@ from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left
 from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.repeats import repeats_itself
-from ehsvjax.diagnosis.decision.search import Selection
-from ehsvjax.diagnosis.decision.trials import with_only
+from ehsvjax.diagnosis.decision.search import Selection, without
+from ehsvjax.diagnosis.decision.trials import refit_set, with_only
 from ehsvjax.diagnosis.hypotheses.curves import TIME, terms_at
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence, dependences
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm, missing_term, told_by
@@ -71,6 +71,8 @@ def examine(selection: Selection) -> Examination:
     chance, chance_behind, alone = _random_force(selection, before, after, innocent)
     if alone:
         selection, after = selection.without_causes(), before
+    elif chance is not None and (needless := _needless_beside(selection, chance)) is not None:
+        return examine(without(selection, needless))
     if chance is not None:
         innocent = True
     elif innocent:
@@ -133,6 +135,20 @@ def _random_force(
             instead = _chance_in(selection, selection.nominal, alone, before)
             return (None, np.inf, False) if instead is None else (instead, behind, True)
     return chance, behind, False
+
+
+def _needless_beside(selection: Selection, chance: ProcessNoise) -> int | None:
+    """Return the cause that gains least beside a random force, if chance would gain as much; None if none does."""
+    spare = {}
+    for cause, need in zip(selection.included, selection.needs, strict=True):
+        rest = tuple(j for j in selection.included if j != cause)
+        start = with_only(selection.bench, selection.final.points[0], rest)
+        refitted = refit_set(selection.trials, start, rest, selection.noise)
+        force = process_noise(selection.bench, refitted, selection.noise, [start])
+        if force is not None:
+            spare[cause] = chance.likelihood - force.likelihood - need.required
+    least = min(spare, key=lambda cause: spare[cause], default=None)
+    return least if least is not None and spare[least] < 0.0 else None
 
 
 def _shows(force: ProcessNoise) -> bool:

@@ -1,7 +1,6 @@
 """What sets of causes predict of data that they were not fitted to: each record from the others, or its own past."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -85,13 +84,13 @@ def predicted(
     later = _later(noise.measured)
     added = np.zeros((len(sets), len(later)))
     for k, left_out in enumerate(later):
-        known = replace(noise, measured=noise.measured & ~left_out)
+        known = noise._replace(measured=noise.measured & ~left_out)
         acting = bench if told is None else told(known)
         used = refit(acting, points, columns, known, race=False)
         added[:, k] = squares - used.cost
         left = used.residual if len(later) == 1 else _left_out(acting, used, k, noise)
         residual = np.where(left_out, left, residual)
-    unused = replace(noise, measured=noise.measured & np.any(later, axis=0))
+    unused = noise._replace(measured=noise.measured & np.any(later, axis=0))
     return Predicted(residual, refitted, unused, added)
 
 

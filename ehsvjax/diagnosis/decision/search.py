@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
-from ehsvjax.diagnosis.bench.discrepancy import Disturbances
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
@@ -84,6 +83,7 @@ class Selection:
     """What the search came to.
 
     Attributes:
+        begun: the workbench before any arithmetic was settled.
         trials: what was tried, with, on their workbench, the samples that were used.
         included: positions of the effects, in the order in which they were found.
         final: the refit with them.
@@ -97,6 +97,7 @@ class Selection:
 
     """
 
+    begun: Workbench
     trials: Trials
     included: tuple[int, ...]
     final: Refits
@@ -148,9 +149,7 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         last = weighed.stage
         if weighed.needless is not None:
             # What was added first can become needless by what was added later.
-            rest = tuple(j for j in last.included if j != weighed.needless)
-            refitted = refit_set(last.trials, last.current.points[0], rest, last.noise)
-            found = _look(last.trials, rest, refitted, last.noise)
+            found = _look_without(last, weighed.needless)
         elif frozenset(last.included) not in looked_beside and len(looked_beside) <= len(stages) + _ROUNDS:
             # Beside what was swapped in, or without what was needless, something else may explain the rest.
             looked_beside.add(frozenset(last.included))
@@ -159,7 +158,25 @@ def select(bench: Workbench, progress: Progress) -> Selection:
             break
         if found is not None:
             weighed = _weighed(found, nominal)
+    return _selection(begun, stages, weighed)
+
+
+def without(selection: Selection, cause: int) -> Selection:
+    """Return a selection without one of its causes, what is left weighed anew."""
+    *stages, last = selection.stages
+    return _selection(selection.begun, stages, _weighed(_look_without(last, cause), selection.nominal))
+
+
+def _look_without(stage: Stage, cause: int) -> Stage:
+    rest = tuple(j for j in stage.included if j != cause)
+    refitted = refit_set(stage.trials, stage.current.points[0], rest, stage.noise)
+    return _look(stage.trials, rest, refitted, stage.noise)
+
+
+def _selection(begun: Workbench, stages: Sequence[Stage], weighed: "_Weighed") -> Selection:
+    last = weighed.stage
     return Selection(
+        begun=begun,
         trials=last.trials,
         included=last.included,
         final=last.current,
@@ -227,7 +244,9 @@ def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise)
     here = int(known.problem.substeps)
     points = np.concatenate([refitted.points for refitted in compared])
     coarse, fine = (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
-    fine = coarse + np.stack([not_made_up_for(*each, noise.scaled) for each in zip(fine - coarse, compared, strict=True)])
+    fine = coarse + np.stack(
+        [not_made_up_for(*each, noise.scaled) for each in zip(fine - coarse, compared, strict=True)]
+    )
     before, after = (np.array([noise.gained(left, every[0]) for left in every]) for every in (coarse, fine))
     worth = float(np.max(np.abs(after - before) / np.maximum(1.0, np.abs(after) / _WEIGHED)))
     if known is bench and worth > 1.0 and not finest(known.problem):
@@ -279,10 +298,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
             bench, current, included, plain_noise(bench.problem.noise_variance, measured), trials.waves
         )
         spanned = current.slopes[0], tried.changes, trials.terms.responses
-        noise = replace(
-            noise_outside(current.residual[0], measured, spanned),
-            disturbances=Disturbances(trials.disturbances, current.slopes[0]),
-        )
+        noise = noise_outside(current.residual[0], measured, spanned)
         before = trials
         trials, current = _known(before, included, current, noise)
         if trials is before:
@@ -335,11 +351,9 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
         penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
-        # While other causes are missing, what is left is theirs as well: the last look judges it (`_needs`).
-        alone = replace(stage.noise, disturbances=None)
         enough = [
             np.isfinite(cost)
-            and alone.in_variances(
+            and stage.noise.in_variances(
                 float(stage.current.cost[0] - cost), stage.current.residual[0], residual
             )[0] > required_gain(bench, stage.screening, s.candidate)
             for s, cost, residual in zip(some, refitted.cost, refitted.residual, strict=True)

@@ -7,11 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ehsvjax.diagnosis.bench.discrepancy import kinds_of, span
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.parts import PARTS, parts_at
 from ehsvjax.diagnosis.bench.progress import Progress
-from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
+from ehsvjax.diagnosis.bench.refits import Refits, padded, refit, span
 from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
 from ehsvjax.diagnosis.hypotheses.curves import Terms, every_curve, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import Waves, waves_of
@@ -36,7 +34,6 @@ class Trials(NamedTuple):
         bench: the workbench.
         seen: what runs along the nominal model and varies, by name.
         terms: of free form, at all places, and what they would do to the outputs of the nominal model.
-        disturbances: what those of the model's signals and of its sensors do to the outputs.
         waves: what harmonic effects would do, by the candidate's name.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
@@ -46,7 +43,6 @@ class Trials(NamedTuple):
     bench: Workbench
     seen: dict[str, Float[np.ndarray, "record time"]]
     terms: Terms
-    disturbances: tuple[Float[np.ndarray, "part record time signal"], ...]
     waves: dict[str, Waves]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Progress
@@ -55,10 +51,7 @@ class Trials(NamedTuple):
 def trials_of(bench: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and harmonic ones would do; nothing has been refitted yet."""
     seen = quantities(bench)
-    terms = terms_at(bench, bench.nominal, every_curve(bench, seen))
-    parts = [parts_at(bench, bench.nominal, place, PARTS) for place in bench.places]
-    disturbances = kinds_of(parts, len(bench.problem.observed))
-    return Trials(bench, seen, terms, disturbances, waves_of(bench), {}, progress)
+    return Trials(bench, seen, terms_at(bench, bench.nominal, every_curve(bench, seen)), waves_of(bench), {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:
