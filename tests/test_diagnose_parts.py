@@ -1,7 +1,5 @@
 """The parts of a diagnosis that can be told from numbers alone: spikes, lattices, whitening, significance, gain."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,10 +7,8 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 from scipy.stats import chi2, norm
 
-from ehsvjax.diagnosis.bench.discrepancy import Disturbances, kinds_of
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, corrected, probabilities, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
-from ehsvjax.diagnosis.bench.parts import Parts
 from ehsvjax.diagnosis.hypotheses.curves import _all_waves, knots_along, single_waves
 from ehsvjax.diagnosis.hypotheses.dependence import _log_of_chi_square
 from ehsvjax.diagnosis.results.gain import _gain
@@ -369,6 +365,7 @@ def test_parts_of_a_record_count_only_where_they_differ_by_more_than_chance(dire
 
 def test_misfit_that_lasts_counts_once_however_short_the_parts_are(monkeypatch):
     """Misfit that returns within 150 samples, and a direction of a few strokes that has no part in it."""
+    noise = plain_noise(np.array([1.0]), np.ones((1, 2000, 1), bool))
     direction = np.sign(np.sin(np.linspace(0.0, 4.0 * np.pi, 2000)))
     rng, decay = np.random.default_rng(2), np.exp(-1.0 / 150.0)
     slow = lfilter([1.0], [1.0, -decay], rng.standard_normal((4000, 2750)))[:, 750:]
@@ -376,24 +373,8 @@ def test_misfit_that_lasts_counts_once_however_short_the_parts_are(monkeypatch):
     left = misfit - np.outer(misfit @ direction, direction) / (direction @ direction)
     for parts in (20, 40):
         monkeypatch.setattr("ehsvjax.diagnosis.bench.noise.PARTS", parts)
-        # A model that does nothing with what disturbs it: all that lasts is the sensor's.
-        of_sample = (np.arange(2000) * parts // 2000)[None]
-        nothing = Parts("force", of_sample, np.zeros(parts, int), 1.0, np.zeros((parts, 1, 2000, 1)))
-        noise = replace(
-            plain_noise(np.array([1.0]), np.ones((1, 2000, 1), bool)),
-            disturbances=Disturbances(kinds_of([nothing], 1), np.zeros((1, 1, 2000, 1))),
-        )
         gains = np.array([noise.gained(series(a), series(b)) for a, b in zip(misfit, left, strict=True)])
         # A likelihood ratio of a few strokes is not quite a chi square (4 and 10% of many draws); taken one by one the
         # parts gave 8 and 18% of gains that are so large, and 19 and 32% where they were half as long.
         assert np.mean(gains > chi2.isf(0.01, 1)) < 0.045, parts
         assert np.mean(gains > chi2.isf(0.05, 1)) < 0.115, parts
-
-
-def test_arithmetic_is_asked_for_what_is_left_and_for_no_less_than_the_noise():
-    measured = np.ones((2, 300, 2), bool)
-    measured[1, 100:, 0] = False
-    residual = np.full(measured.shape, 0.1)
-    residual[0, :, 1], residual[1, 100:, 0] = 6.0, np.nan
-    excess = plain_noise(np.array([4.0, 9.0]), measured).excess(residual)
-    np.testing.assert_allclose(excess, [[1.0, 4.0], [1.0, 1.0]])

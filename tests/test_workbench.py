@@ -11,11 +11,11 @@ from scipy.signal import lsim
 import ehsvjax
 from benchmarks.real_models import damper
 from ehsvjax.diagnosis.bench.noise import plain_noise
-from ehsvjax.diagnosis.bench.refits import padded, refit
+from ehsvjax.diagnosis.bench.refits import not_made_up_for, padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
 from ehsvjax.diagnosis.decision.rivals import Rival, rivals_again
-from ehsvjax.diagnosis.decision.search import _look, _weighed
+from ehsvjax.diagnosis.decision.search import _look, _settled, _weighed
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
 from ehsvjax.diagnosis.hypotheses.screening import Screened
@@ -225,3 +225,40 @@ def test_sketches_follow_a_model_to_where_it_is_stiff():
     off = np.abs(followed.sketched(stiff[None]) - followed.simulated(stiff[None]))
     assert np.mean(off > noise) < 0.3
     assert settled(followed, followed.stepped(stiff[None]), np.array([noise**2])) is followed
+
+
+def test_arithmetic_is_asked_for_what_is_left_along_it_and_for_no_less_than_the_noise(bench):
+    point, samples = bench.nominal[None], bench.problem.samples
+    coarse = replace(bench, problem=replace(bench.problem, substeps=np.int32(1)))
+    exact, here = (bench.simulated(point, substeps=n)[0] for n in (64, 1))
+    off = here - exact
+    # Its sum of squares is 25 times that of which nothing is asked.
+    noise = plain_noise(np.array([float(np.sum(off**2)) / (25.0 * 0.05)]), samples.measured)
+
+    def steps(left):
+        readings = replace(coarse.problem, samples=samples._replace(outputs=here + left))
+        return int(_settled(replace(coarse, problem=readings), point, noise).problem.substeps)
+
+    rng = np.random.default_rng(0)
+    white = np.sqrt(noise.variances[0]) * rng.standard_normal(off.shape)
+    assert steps(white) > 1
+    # What is left beside it asks for no less; what is left in its direction, part by part, does.
+    assert steps(white + 30.0 * np.sqrt(noise.variances[0]) * (np.arange(SAMPLES) == 7)[:, None]) == steps(white)
+    signs = np.repeat(rng.choice([-1.0, 1.0], 20), SAMPLES // 20)[:, None]
+    assert steps(white + 1e3 * signs * off) == 1
+
+
+def test_what_unknowns_make_up_for_is_nothing_to_them(bench):
+    trials = trials_of(bench, lambda *_: None)
+    plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
+    refitted = refit_set_of_nothing(trials, plain)
+    beside = np.random.default_rng(1).standard_normal(refitted.residual[0].shape)
+    basis = np.linalg.qr(plain.scaled(refitted.slopes[0][: len(bench.base_columns)]).T)[0]
+    scaled = plain.scaled(beside)
+    expected = scaled - basis @ (basis.T @ scaled)
+    moved = beside + np.tensordot(np.linspace(-3.0, 2.0, len(refitted.slopes[0])), refitted.slopes[0], 1)
+    np.testing.assert_allclose(plain.scaled(not_made_up_for(moved, refitted, plain.scaled)), expected, atol=1e-6)
+
+
+def refit_set_of_nothing(trials, noise):
+    return refit_sets(trials, [[trials.bench.nominal]], [()], noise)

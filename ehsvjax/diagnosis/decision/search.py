@@ -240,7 +240,7 @@ def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise)
     Where another is far behind, its arithmetic counts as a part of that.
     """
     readings = bench.problem.samples.outputs
-    known = _settled(bench, compared[0], noise)
+    known = _settled(bench, compared[0].points, noise)
     here = int(known.problem.substeps)
     points = np.concatenate([refitted.points for refitted in compared])
     coarse, fine = (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
@@ -254,11 +254,11 @@ def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise)
     return known, worth
 
 
-def _settled(bench: Workbench, refitted: Refits, noise: Noise) -> Workbench:
+def _settled(bench: Workbench, point: Float[np.ndarray, "1 parameter"], noise: Noise) -> Workbench:
     """Return the bench settled for one explanation: as any change of the outputs, what its arithmetic makes of them
     counts in variances of what is left along it.
     """
-    outputs_at, here = bench.stepped(refitted.points), int(bench.problem.substeps)
+    outputs_at, here = bench.stepped(point), int(bench.problem.substeps)
     off = noise.scaled(outputs_at(2 * here)[0] - outputs_at(here)[0])
     left = noise.scaled(bench.problem.samples.outputs - outputs_at(here)[0])
     variance, _ = noise.left_along(off, left) if 0.0 < float(off @ off) < np.inf else (1.0, np.inf)
@@ -316,7 +316,7 @@ def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: No
     """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
     while True:
         bench = trials.bench
-        known = without_jumps(_settled(bench, current, noise), current, noise)
+        known = without_jumps(_settled(bench, current.points, noise), current, noise)
         if known is bench:
             return trials, current
         trials = trials._replace(bench=known)

@@ -1,0 +1,53 @@
+"""A random force, alone and beside a cause, on an integrator of its own: a ball on a beam, which nothing holds."""
+
+import jax
+import numpy as np
+import pytest
+
+import ehsvjax
+from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
+from tests.small_models import ball, shaken_ball
+
+pytestmark = pytest.mark.xdist_group("diagnoses of a ball")
+PERIOD, SAMPLES, NOISE = 0.1, 336, 5e-4
+CHANCE = {PROCESS_NOISE, UNKNOWN}
+
+
+def diagnosed(seed, density, samples=SAMPLES, **plant):
+    rng = np.random.default_rng(seed)
+    angle = np.repeat(rng.uniform(-0.05, 0.05, samples // 8), 8)
+    position = shaken_ball(angle, PERIOD, density, rng, **plant) + rng.normal(0.0, NOISE, len(angle))
+    record = ehsvjax.Record(PERIOD * np.arange(len(angle)), {"angle": angle}, {"position": position})
+    fit = ehsvjax.identify(ball(), record, key=jax.random.key(0))
+    return ehsvjax.diagnose(fit, record, key=jax.random.key(1))
+
+
+def names_in(diagnosis):
+    return {c.name for c in diagnosis.causes} | {name for group in diagnosis.alternatives for name in group.causes}
+
+
+@pytest.mark.thorough
+def test_a_random_force_on_what_nothing_holds_is_chance_and_no_cause():
+    """Of many, see benchmarks/shaken.py."""
+    diagnosis = diagnosed(0, 1.6e-4)
+    assert names_in(diagnosis) <= CHANCE, diagnosis
+    assert diagnosis.verdict != "adequate"
+
+
+@pytest.mark.thorough
+def test_beside_a_random_force_only_what_gains_beside_it_is_a_cause():
+    """A bias of the input was named for what the force had moved."""
+    diagnosis = diagnosed(59182745, 5.7e-5, stiffness=0.1036)
+    assert {c.name for c in diagnosis.causes} - CHANCE == {"linear_stiffness"}, diagnosis
+    assert names_in(diagnosis) <= {"linear_stiffness", *CHANCE}, diagnosis
+    assert PROCESS_NOISE in names_in(diagnosis)
+
+
+def test_a_cause_is_named_beside_a_random_force():
+    diagnosis = diagnosed(7, 1e-5, samples=672, stiffness=0.5)
+    spring, chance = diagnosis.causes
+    assert (spring.name, chance.name) == ("linear_stiffness", PROCESS_NOISE)
+    assert spring.probability > 0.99
+    (size,) = spring.sizes
+    assert abs(size.value - 0.5) < 4.0 * size.standard_error < 0.1
+    assert chance.sizes[0].value == pytest.approx(1e-5, rel=0.4)
