@@ -74,7 +74,8 @@ def diagnose(
     unseen = () if validation is None else checked_records(validation, "validation")
     _check(fit, measured, unseen, key, progress)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).tolist())
-    with progress_bar(progress) as say:
+    # What a trial cannot simulate is infinite or no number, and never wins: nobody need be warned of it.
+    with progress_bar(progress) as say, np.errstate(over="ignore", invalid="ignore"):
         return _diagnosed(fit, measured, unseen, bank, rng, say)
 
 

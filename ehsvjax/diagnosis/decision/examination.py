@@ -25,15 +25,14 @@ class Examination(NamedTuple):
     """What is left of the residual, and of the causes.
 
     Attributes:
-        selection: with the noise of what is left; without causes if chance, a random force, explains all.
+        selection: with the noise of what is left, without causes that a random force can stand for.
         before: what the nominal model's residual depends on, the most significant first.
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
         undecided: whether it is nothing if all that is left is noise: one record does not tell.
-        chance: the random force that explains the nominal model's residual better than any cause, or what all causes
-            leave; None if none does.
-        chance_behind: noise variances by which a random force alone is behind all causes together, what it has to be
-            better by included.
+        chance: the random force that explains what the causes leave; None if none does.
+        chance_behind: noise variances by which a random force alone is behind all causes together, less what chance
+            would gain with these; infinite where none shows.
         instead: one term of free form that explains the record as well as all causes together, but for the price of
             its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -68,11 +67,12 @@ def examine(selection: Selection) -> Examination:
         undecided = everything.coloured and not _significant(dependences(selection.final, everything, terms))
     repeated = repeats_itself(bench, selection.final.residual[0], noise) if undecided else None
     innocent = repeated is False or not _significant(after)
-    chance, chance_behind, alone = _random_force(selection, before, after, innocent)
-    if alone:
-        selection, after = selection.without_causes(), before
-    elif chance is not None and (needless := _needless_beside(selection, chance)) is not None:
-        return examine(without(selection, needless))
+    force = process_noise(bench, selection.final, noise)
+    chance, chance_behind = None, np.inf
+    if force is not None:
+        if (needless := _needless(selection, force)) is not None:
+            return examine(without(selection, needless))
+        chance, chance_behind = _chance_in(selection, selection.final, force, after), _behind(selection, force)
     if chance is not None:
         innocent = True
     elif innocent:
@@ -106,39 +106,14 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
     return (*tests[:_SUSPECTS], *at_home)
 
 
-def _random_force(
-    selection: Selection, before: tuple[Dependence, ...], after: tuple[Dependence, ...], innocent: bool
-) -> tuple[ProcessNoise | None, float, bool]:
-    """Return the random force that explains the records better than any cause, or else what the causes leave of them.
+def _needless(selection: Selection, beside: ProcessNoise) -> int | None:
+    """Return the cause that gains least, if a random force in its place is as likely as chance would be with it.
 
-    And by how much the force alone explains the records worse than the causes do; and whether it is alone: what the
-    causes seemed to explain was then the motion that it had left behind.
+    Args:
+        selection: the causes.
+        beside: a random force in what they leave.
+
     """
-    bench, noise = selection.bench, selection.noise
-    # What the causes have made of the model's unknowns may be nearer.
-    found = with_only(bench, selection.final.points[0], ())
-    alone, behind = process_noise(bench, selection.nominal, noise, [found]), np.inf
-    beside = process_noise(bench, selection.final, noise) if selection.included else None
-    chance = None
-    if beside is not None and _shows(beside):
-        chance = _chance_in(selection, selection.final, beside, after)
-    if alone is not None and _shows(alone):
-        if not selection.included:
-            behind = -np.inf
-        elif chance is not None:
-            # Beside a force they must gain what anything else must that is added.
-            behind = chance.likelihood - alone.likelihood - sum(need.required for need in selection.needs)
-        elif beside is not None:  # else the causes have made any force invisible
-            behind = beside.of_sensor - alone.likelihood - _least_price(selection)
-            behind += _must_be_better_by(selection, innocent)
-        if behind < 0.0:
-            instead = _chance_in(selection, selection.nominal, alone, before)
-            return (None, np.inf, False) if instead is None else (instead, behind, True)
-    return chance, behind, False
-
-
-def _needless_beside(selection: Selection, chance: ProcessNoise) -> int | None:
-    """Return the cause that gains least beside a random force, if chance would gain as much; None if none does."""
     spare = {}
     for cause, need in zip(selection.included, selection.needs, strict=True):
         rest = tuple(j for j in selection.included if j != cause)
@@ -146,9 +121,25 @@ def _needless_beside(selection: Selection, chance: ProcessNoise) -> int | None:
         refitted = refit_set(selection.trials, start, rest, selection.noise)
         force = process_noise(selection.bench, refitted, selection.noise, [start])
         if force is not None:
-            spare[cause] = chance.likelihood - force.likelihood - need.required
-    least = min(spare, key=lambda cause: spare[cause], default=None)
-    return least if least is not None and spare[least] < 0.0 else None
+            spare[cause] = beside.best - force.likelihood - need.required, refitted, force
+    least = min(spare, key=lambda cause: spare[cause][0], default=None)
+    if least is None or not spare[least][0] < 0.0:
+        return None
+    _, refitted, force = spare[least]
+    terms = terms_at(selection.bench, refitted.points[0], selection.trials.terms.curves)
+    tests = dependences(refitted, selection.noise, terms)
+    return None if _chance_in(selection, refitted, force, tests) is None else least
+
+
+def _behind(selection: Selection, beside: ProcessNoise) -> float:
+    """Return by how much a random force alone explains the records worse than all causes do; see `Examination`."""
+    if not selection.included:
+        return np.inf
+    found = with_only(selection.bench, selection.final.points[0], ())
+    alone = process_noise(selection.bench, selection.nominal, selection.noise, [found])
+    if alone is None or not _shows(alone):
+        return np.inf
+    return beside.best - alone.likelihood - sum(need.required for need in selection.needs)
 
 
 def _shows(force: ProcessNoise) -> bool:
@@ -163,18 +154,13 @@ def _chance_in(
     What repeats itself is none, and a term that depends on what runs along the model is a better reason.
     """
     repeated = repeats_itself(selection.bench, refitted.residual[0], selection.noise)
-    if repeated:
+    if repeated or not _shows(force):
         return None
     if _significant(tests):
         term, _ = missing_term(selection.bench, refitted, selection.noise, selection.seen, _suspects(tests))
         if _likelihood(selection.noise, term) > force.likelihood:
             return None
     return force._replace(settled=repeated is False)
-
-
-def _must_be_better_by(selection: Selection, innocent: bool) -> float:
-    """Return by how much a random force must beat causes: a single one that leaves nothing has the first word."""
-    return CONVINCING if innocent and len(selection.included) == 1 else INSEPARABLE
 
 
 def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
@@ -205,19 +191,6 @@ def _likelihood(noise: Noise, term: MissingTerm) -> float:
     """Return twice the logarithm of the likelihood of what a term leaves, less Bayes' price for its pieces."""
     r = noise.innovations(term.residual)
     return -noise.log_units - float(len(r) * (np.log(r @ r / len(r)) + 1.0) + term.pieces * np.log(len(r)))
-
-
-def _least_price(selection: Selection) -> float:
-    """Return Bayes' price for all causes but that of one number, each in the shape of its cheapest rival.
-
-    What a rival fits worse counts as part of its price: two numbers that explain as much as one are no better.
-    """
-    cheapest = [
-        min(float(r.refitted.cost[0] - selection.final.cost[0]) + _price(selection, r.candidate)
-            for r in group if r.deficit < INSEPARABLE)
-        for group in selection.rivals
-    ]  # fmt: skip
-    return sum(cheapest) - float(np.log(selection.noise.measured.sum()))
 
 
 def _price(selection: Selection, candidate: int) -> float:

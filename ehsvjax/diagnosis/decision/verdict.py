@@ -65,7 +65,7 @@ def verdict_of(examined: Examination, predicts: bool) -> Verdict:
     if examined.lacking or not (examined.innocent or groups):
         return Verdict("unexplained", (), (), ())
     others = [{name: 1.0} for name in _quantised(selection)]
-    others += [_chance(examined, examined.chance)] if examined.chance else []
+    others += [_chance(examined.chance)] if examined.chance else []
     included = (*(selection.included[k] for k in order), *(None for _ in others))
     every = (*groups, *others)
     if not every:
@@ -100,16 +100,11 @@ def _nothing_behind(need: Need) -> float:
     return need.gain - need.required
 
 
-def _chance(examined: Examination, chance: ProcessNoise) -> dict[str, float]:
-    """Return how probable a random force is against the causes that it was found in the place of, or beside.
-
-    Unless the experiment was repeated, nothing speaks for it against a term that the bank lacks.
+def _chance(chance: ProcessNoise) -> dict[str, float]:
+    """Return what may be there of chance: unless the experiment was repeated, nothing speaks for it against a term that
+    the bank lacks.
     """
-    instead = not examined.selection.included
-    probable = float(probabilities([0.0, -examined.chance_behind])[0]) if instead else 1.0
-    if chance.settled:
-        return {PROCESS_NOISE: probable}
-    return {PROCESS_NOISE: probable / 2.0, UNKNOWN: probable / 2.0}
+    return {PROCESS_NOISE: 1.0} if chance.settled else {PROCESS_NOISE: 0.5, UNKNOWN: 0.5}
 
 
 def _quantised(selection: Selection) -> tuple[str, ...]:

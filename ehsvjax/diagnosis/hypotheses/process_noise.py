@@ -41,6 +41,11 @@ class ProcessNoise(NamedTuple):
     of_sensor: float
     settled: bool = False
 
+    @property
+    def best(self) -> float:
+        """The likelihood of the better of the two."""
+        return max(self.likelihood, self.of_sensor)
+
 
 def process_noise(
     bench: Workbench, final: Refits, noise: Noise, also: Sequence[Float[np.ndarray, " parameter"]] = ()
