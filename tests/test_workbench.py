@@ -15,13 +15,14 @@ from ehsvjax.diagnosis.bench.refits import not_made_up_for, padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
 from ehsvjax.diagnosis.decision.rivals import Rival, rivals_again
-from ehsvjax.diagnosis.decision.search import _look, _settled, _weighed
-from ehsvjax.diagnosis.decision.trials import refit_screened, refit_sets, trials_of
+from ehsvjax.diagnosis.decision.search import Stage, _from_nominal_starts_too, _look, _settled, _weighed
+from ehsvjax.diagnosis.decision.trials import refit_screened, refit_set, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
-from ehsvjax.diagnosis.hypotheses.screening import Screened
+from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening
 from ehsvjax.effects import BANK
 from ehsvjax.population import cast, simulated
 from tests.compilations import compilations
+from tests.hidden_plants import servovalve_with
 
 # One process compiles; records are as long as those of test_diagnose.py.
 pytestmark = pytest.mark.xdist_group("diagnoses of the oscillator")
@@ -262,3 +263,21 @@ def test_what_unknowns_make_up_for_is_nothing_to_them(bench):
 
 def refit_set_of_nothing(trials, noise):
     return refit_sets(trials, [[trials.bench.nominal]], [()], noise)
+
+
+def test_a_start_that_ran_to_where_a_limit_hides_it_is_left_for_the_nominal_one():
+    """A spool that begins far beyond its stop, and a position to match: of such a record "something is left"."""
+    command = np.repeat(np.random.default_rng(3).choice([-6e-3, 6e-3], 13), 48)[:SAMPLES]
+    position = servovalve_with([{}], command[None], 1e-3)["position"][0]
+    noisy = position + 1e-4 * np.random.default_rng(4).standard_normal(SAMPLES)
+    record = ehsvjax.Record(1e-3 * np.arange(SAMPLES), {"command": command}, {"position": noisy})
+    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=jax.random.key(0), population=50, generations=20)
+    of_valve = workbench(fit, [record], [effect for effect in BANK if effect.name == "constant_load"])
+    noise = plain_noise(of_valve.problem.noise_variance, of_valve.problem.samples.measured)
+    trials = trials_of(of_valve, lambda *_: None)
+    point = of_valve.nominal.copy()
+    point[[of_valve.column[f"{name}[0]"] for name in ("initial_filtered", "initial_filtered_rate")]] = 0.0
+    there = refit_set(trials, point, (), noise)
+    assert there.cost[0] > 1.1 * SAMPLES
+    stage = Stage(trials, (), there, noise, Screening((), (), 0.0))
+    assert _from_nominal_starts_too(stage).cost[0] < there.cost[0] - 50.0

@@ -23,6 +23,7 @@ from ehsvjax.diagnosis.decision.trials import (
     refit_reshaped,
     refit_screened,
     refit_set,
+    refit_sets,
     trials_of,
 )
 from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, responses_at, screen
@@ -216,7 +217,8 @@ class _Weighed(NamedTuple):
 def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
     looked_at = set(stage.included)
-    included, final, rivals = rivals_of_all(stage.trials, stage.included, stage.current, stage.noise)
+    final = _from_nominal_starts_too(stage)
+    included, final, rivals = rivals_of_all(stage.trials, stage.included, final, stage.noise)
     for rounds_left in reversed(range(_ROUNDS)):
         stage = stage._replace(included=included, current=final)
         trials, noise = stage.trials, stage.noise
@@ -230,6 +232,22 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
         included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
     needs, unused = _needs(stage, nominal)
     return _Weighed(stage, nominal, rivals, needs, unused, _needless(included, needs, unused), worth)
+
+
+def _from_nominal_starts_too(stage: Stage) -> Refits:
+    """Return the refit of a stage's causes also from where each record would start nominally.
+
+    Without the causes a start may have run to a bound to make up for them, where a limit hides it: a spool that begins
+    far beyond its stop moves nothing.
+    """
+    bench, point = stage.trials.bench, stage.current.points[0]
+    start = point.copy()
+    for k, record in enumerate(bench.records):
+        for name, value in bench.fit.initial_of(record, "nominal").items():
+            column = bench.column.get(f"{name}[{k}]")
+            if column is not None:
+                start[column] = bench.coordinate(value, column)
+    return refit_sets(stage.trials, [[point, start]], [stage.included], stage.noise)
 
 
 def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise) -> tuple[Workbench, float]:
