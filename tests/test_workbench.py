@@ -252,17 +252,13 @@ def test_arithmetic_is_asked_for_what_is_left_along_it_and_for_no_less_than_the_
 def test_what_unknowns_make_up_for_is_nothing_to_them(bench):
     trials = trials_of(bench, lambda *_: None)
     plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
-    refitted = refit_set_of_nothing(trials, plain)
+    refitted = refit_set(trials, bench.nominal, (), plain)
     beside = np.random.default_rng(1).standard_normal(refitted.residual[0].shape)
     basis = np.linalg.qr(plain.scaled(refitted.slopes[0][: len(bench.base_columns)]).T)[0]
     scaled = plain.scaled(beside)
     expected = scaled - basis @ (basis.T @ scaled)
     moved = beside + np.tensordot(np.linspace(-3.0, 2.0, len(refitted.slopes[0])), refitted.slopes[0], 1)
     np.testing.assert_allclose(plain.scaled(not_made_up_for(moved, refitted, plain.scaled)), expected, atol=1e-6)
-
-
-def refit_set_of_nothing(trials, noise):
-    return refit_sets(trials, [[trials.bench.nominal]], [()], noise)
 
 
 def test_a_start_that_ran_to_where_a_limit_hides_it_is_left_for_the_nominal_one():

@@ -70,8 +70,8 @@ def examine(selection: Selection) -> Examination:
     force = process_noise(bench, selection.final, noise)
     chance, chance_behind = None, np.inf
     if force is not None:
-        if (needless := _needless(selection, force)) is not None:
-            return examine(without(selection, needless))
+        if (replaced := _replaced_by_chance(selection, force)) is not None:
+            return examine(without(selection, replaced))
         chance, chance_behind = _chance_in(selection, selection.final, force, after), _behind(selection, force)
     if chance is not None:
         innocent = True
@@ -106,7 +106,7 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
     return (*tests[:_SUSPECTS], *at_home)
 
 
-def _needless(selection: Selection, beside: ProcessNoise) -> int | None:
+def _replaced_by_chance(selection: Selection, beside: ProcessNoise) -> int | None:
     """Return the cause that gains least, if a random force in its place is as likely as chance would be with it.
 
     Args:
