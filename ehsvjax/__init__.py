@@ -33,6 +33,8 @@ from ehsvjax.record import Record
 from ehsvjax.score import Score
 from ehsvjax.simulate import simulate
 
+__version__ = "0.2.0"
+
 __all__ = [
     "Band",
     "Bootstrap",

@@ -1,5 +1,6 @@
 """What is written for those who join: its code runs, its links lead somewhere, its versions are the package's."""
 
+import importlib.metadata
 import re
 from pathlib import Path
 
@@ -43,6 +44,7 @@ def test_code_in_documents_can_be_read(document):
 
 
 def test_versions_agree():
-    version = re.search(r'^version = "(.+)"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)[1]
+    version = ehsvjax.__version__
+    assert importlib.metadata.version("ehsvjax") == version
     assert re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1] == version
     assert f"## {version}" in (ROOT / "CHANGELOG.md").read_text()
