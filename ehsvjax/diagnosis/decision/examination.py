@@ -32,7 +32,7 @@ class Examination(NamedTuple):
         undecided: whether it is nothing if all that is left is noise: one record does not tell.
         chance: the random force that explains what the causes leave; None if none does.
         chance_behind: noise variances by which a random force alone is behind all causes together, less what chance
-            would gain with these; infinite where none shows.
+            would gain with these; infinite where none is about as likely.
         instead: one term of free form that explains the record as well as all causes together, but for the price of
             its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -70,9 +70,14 @@ def examine(selection: Selection) -> Examination:
     force = process_noise(bench, selection.final, noise)
     chance, chance_behind = None, np.inf
     if force is not None:
-        if (replaced := _replaced_by_chance(selection, force)) is not None:
-            return examine(without(selection, replaced))
-        chance, chance_behind = _chance_in(selection, selection.final, force, after), _behind(selection, force)
+        instead_of = _chance_instead(selection, force)
+        least = min(instead_of, key=lambda causes: instead_of[causes].behind, default=None)
+        if least is not None and instead_of[least].behind < 0.0 and _stands(selection, instead_of[least]):
+            return examine(without(selection, least))
+        chance = _chance_in(selection, selection.final, force, after)
+        alone = instead_of.get(selection.included)
+        if alone is not None and alone.behind < INSEPARABLE and _stands(selection, alone):
+            chance_behind = alone.behind
     if chance is not None:
         innocent = True
     elif innocent:
@@ -106,44 +111,47 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
     return (*tests[:_SUSPECTS], *at_home)
 
 
-def _replaced_by_chance(selection: Selection, beside: ProcessNoise) -> int | None:
-    """Return the cause that gains least, if a random force in its place is as likely as chance would be with it.
+class _Instead(NamedTuple):
+    """A random force in the place of causes, all else refitted under it, and how much less likely it is.
+
+    Attributes:
+        refitted: the same without a force.
+        force: the random force.
+        behind: noise variances by which it is less likely than these causes, less what chance would gain with them.
+
+    """
+
+    refitted: Refits
+    force: ProcessNoise
+    behind: float
+
+
+def _chance_instead(selection: Selection, beside: ProcessNoise) -> dict[tuple[int, ...], _Instead]:
+    """Return a random force in the place of each of the causes, and of all of them.
 
     Args:
         selection: the causes.
         beside: a random force in what they leave.
 
     """
-    spare = {}
-    for cause, need in zip(selection.included, selection.needs, strict=True):
-        rest = tuple(j for j in selection.included if j != cause)
+    found = {}
+    required = {cause: need.required for cause, need in zip(selection.included, selection.needs, strict=True)}
+    for causes in dict.fromkeys([*((cause,) for cause in required), tuple(required)] if required else ()):
+        rest = tuple(j for j in required if j not in causes)
         start = with_only(selection.bench, selection.final.points[0], rest)
         refitted = refit_set(selection.trials, start, rest, selection.noise)
         force = process_noise(selection.bench, refitted, selection.noise, [start])
         if force is not None:
-            spare[cause] = beside.best - force.likelihood - need.required, refitted, force
-    least = min(spare, key=lambda cause: spare[cause][0], default=None)
-    if least is None or not spare[least][0] < 0.0:
-        return None
-    _, refitted, force = spare[least]
-    terms = terms_at(selection.bench, refitted.points[0], selection.trials.terms.curves)
-    tests = dependences(refitted, selection.noise, terms)
-    return None if _chance_in(selection, refitted, force, tests) is None else least
+            behind = beside.best - force.likelihood - sum(required[cause] for cause in causes)
+            found[causes] = _Instead(refitted, force, behind)
+    return found
 
 
-def _behind(selection: Selection, beside: ProcessNoise) -> float:
-    """Return by how much a random force alone explains the records worse than all causes do; see `Examination`."""
-    if not selection.included:
-        return np.inf
-    found = with_only(selection.bench, selection.final.points[0], ())
-    alone = process_noise(selection.bench, selection.nominal, selection.noise, [found])
-    if alone is None or not _shows(alone):
-        return np.inf
-    return beside.best - alone.likelihood - sum(need.required for need in selection.needs)
-
-
-def _shows(force: ProcessNoise) -> bool:
-    return force.likelihood - force.of_sensor > CONVINCING
+def _stands(selection: Selection, instead: _Instead) -> bool:
+    """Whether a random force in the place of causes is chance."""
+    terms = terms_at(selection.bench, instead.refitted.points[0], selection.trials.terms.curves)
+    tests = dependences(instead.refitted, selection.noise, terms)
+    return _chance_in(selection, instead.refitted, instead.force, tests) is not None
 
 
 def _chance_in(
@@ -154,7 +162,7 @@ def _chance_in(
     What repeats itself is none, and a term that depends on what runs along the model is a better reason.
     """
     repeated = repeats_itself(selection.bench, refitted.residual[0], selection.noise)
-    if repeated or not _shows(force):
+    if repeated or not force.likelihood - force.of_sensor > CONVINCING:
         return None
     if _significant(tests):
         term, _ = missing_term(selection.bench, refitted, selection.noise, selection.seen, _suspects(tests))

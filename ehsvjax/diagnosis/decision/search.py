@@ -150,7 +150,7 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         last = weighed.stage
         if weighed.needless is not None:
             # What was added first can become needless by what was added later.
-            found = _look_without(last, weighed.needless)
+            found = _look_without(last, [weighed.needless])
         elif frozenset(last.included) not in looked_beside and len(looked_beside) <= len(stages) + _ROUNDS:
             # Beside what was swapped in, or without what was needless, something else may explain the rest.
             looked_beside.add(frozenset(last.included))
@@ -162,14 +162,14 @@ def select(bench: Workbench, progress: Progress) -> Selection:
     return _selection(begun, stages, weighed)
 
 
-def without(selection: Selection, cause: int) -> Selection:
-    """Return a selection without one of its causes, what is left weighed anew."""
+def without(selection: Selection, causes: Sequence[int]) -> Selection:
+    """Return a selection without some of its causes, what is left weighed anew."""
     *stages, last = selection.stages
-    return _selection(selection.begun, stages, _weighed(_look_without(last, cause), selection.nominal))
+    return _selection(selection.begun, stages, _weighed(_look_without(last, causes), selection.nominal))
 
 
-def _look_without(stage: Stage, cause: int) -> Stage:
-    rest = tuple(j for j in stage.included if j != cause)
+def _look_without(stage: Stage, causes: Sequence[int]) -> Stage:
+    rest = tuple(j for j in stage.included if j not in causes)
     refitted = refit_set(stage.trials, stage.current.points[0], rest, stage.noise)
     return _look(stage.trials, rest, refitted, stage.noise)
 

@@ -90,7 +90,7 @@ def _group(examined: Examination, k: int) -> dict[str, float]:
         name = selection.bench.candidates[rival.candidate].name
         if rival.deficit < INSEPARABLE:
             found[name] = found.get(name, 0.0) + float(probable)
-    if examined.chance_behind < INSEPARABLE:
+    if np.isfinite(examined.chance_behind):
         found[PROCESS_NOISE] = float(every[len(rivals)])
     return found
 
