@@ -71,13 +71,11 @@ def examine(selection: Selection) -> Examination:
     chance, chance_behind = None, np.inf
     if force is not None:
         instead_of = _chance_instead(selection, force)
-        least = min(instead_of, key=lambda causes: instead_of[causes].behind, default=None)
-        if least is not None and instead_of[least].behind < 0.0 and _stands(selection, instead_of[least]):
+        least = min(instead_of, key=lambda causes: instead_of[causes], default=())
+        if least and instead_of[least] < 0.0:
             return examine(without(selection, least))
         chance = _chance_in(selection, selection.final, force, after)
-        alone = instead_of.get(selection.included)
-        if alone is not None and alone.behind < INSEPARABLE and _stands(selection, alone):
-            chance_behind = alone.behind
+        chance_behind = instead_of.get(selection.included, np.inf)
     if chance is not None:
         innocent = True
     elif innocent:
@@ -111,47 +109,32 @@ def _suspects(tests: tuple[Dependence, ...]) -> tuple[Dependence, ...]:
     return (*tests[:_SUSPECTS], *at_home)
 
 
-class _Instead(NamedTuple):
-    """A random force in the place of causes, all else refitted under it, and how much less likely it is.
+def _chance_instead(selection: Selection, beside: ProcessNoise) -> dict[tuple[int, ...], float]:
+    """Return what a random force can stand for as well: each of the causes, or all of them.
 
-    Attributes:
-        refitted: the same without a force.
-        force: the random force.
-        behind: noise variances by which it is less likely than these causes, less what chance would gain with them.
-
-    """
-
-    refitted: Refits
-    force: ProcessNoise
-    behind: float
-
-
-def _chance_instead(selection: Selection, beside: ProcessNoise) -> dict[tuple[int, ...], _Instead]:
-    """Return a random force in the place of each of the causes, and of all of them.
+    With the noise variances by which it is less likely, all else refitted under it, than they are, less what chance
+    would gain with them.
 
     Args:
         selection: the causes.
         beside: a random force in what they leave.
 
     """
-    found = {}
+    bench, noise, found = selection.bench, selection.noise, {}
     required = {cause: need.required for cause, need in zip(selection.included, selection.needs, strict=True)}
     for causes in dict.fromkeys([*((cause,) for cause in required), tuple(required)] if required else ()):
         rest = tuple(j for j in required if j not in causes)
-        start = with_only(selection.bench, selection.final.points[0], rest)
-        refitted = refit_set(selection.trials, start, rest, selection.noise)
-        force = process_noise(selection.bench, refitted, selection.noise, [start])
-        if force is not None:
-            behind = beside.best - force.likelihood - sum(required[cause] for cause in causes)
-            found[causes] = _Instead(refitted, force, behind)
+        start = with_only(bench, selection.final.points[0], rest)
+        refitted = refit_set(selection.trials, start, rest, noise)
+        force = process_noise(bench, refitted, noise, [start])
+        if force is None:
+            continue
+        behind = beside.best - force.likelihood - sum(required[cause] for cause in causes)
+        if behind < INSEPARABLE:
+            terms = terms_at(bench, refitted.points[0], selection.trials.terms.curves)
+            if _chance_in(selection, refitted, force, dependences(refitted, noise, terms)) is not None:
+                found[causes] = behind
     return found
-
-
-def _stands(selection: Selection, instead: _Instead) -> bool:
-    """Whether a random force in the place of causes is chance."""
-    terms = terms_at(selection.bench, instead.refitted.points[0], selection.trials.terms.curves)
-    tests = dependences(instead.refitted, selection.noise, terms)
-    return _chance_in(selection, instead.refitted, instead.force, tests) is not None
 
 
 def _chance_in(
