@@ -23,7 +23,7 @@ ROOMS = ("of_excitation", "of_operators", "of_models", "of_hydraulics", "of_effe
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("room", ROOMS)
-def test_wrong_arguments_are_refused_by_a_sentence_and_at_once(room):
+def test_wrong_arguments_are_refused_by_a_sentence(room):
     calls = list(getattr(damaged_arguments, room)())
     # The right calls all, of the wrong ones every sixth.
     chosen = [call for i, call in enumerate(calls) if call.may_answer or i % 6 == 0]
@@ -31,7 +31,7 @@ def test_wrong_arguments_are_refused_by_a_sentence_and_at_once(room):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_wrong_arguments_of_records_and_fits_are_refused_by_a_sentence_and_at_once():
+def test_wrong_arguments_of_records_and_fits_are_refused_by_a_sentence():
     calls = [call for call in damaged_results.calls() if not call.may_answer]
     assert offenders([answer_of(call) for call in calls[::7]]) == []
 
