@@ -1,6 +1,7 @@
 """Calls that cannot be meant, refused by a sentence: a share of `benchmarks/damaged_calls.py`, and what words say."""
 
 import re
+import time
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ ROOMS = ("of_excitation", "of_operators", "of_models", "of_hydraulics", "of_effe
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("room", ROOMS)
-def test_wrong_arguments_are_refused_by_a_sentence(room):
+def test_wrong_arguments_are_refused_by_a_sentence_and_at_once(room):
     calls = list(getattr(damaged_arguments, room)())
     # The right calls all, of the wrong ones every sixth.
     chosen = [call for i, call in enumerate(calls) if call.may_answer or i % 6 == 0]
@@ -30,7 +31,7 @@ def test_wrong_arguments_are_refused_by_a_sentence(room):
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_wrong_arguments_of_records_and_fits_are_refused_by_a_sentence():
+def test_wrong_arguments_of_records_and_fits_are_refused_by_a_sentence_and_at_once():
     calls = [call for call in damaged_results.calls() if not call.may_answer]
     assert offenders([answer_of(call) for call in calls[::7]]) == []
 
@@ -177,7 +178,8 @@ def test_nothing_left_to_identify_says_what_could_be_freed():
 # --- Sizes, units, files ---
 
 
-def test_absurd_sizes_are_refused():
+def test_absurd_sizes_are_refused_at_once():
+    began = time.perf_counter()
     with pytest.raises(
         ValueError, match=r"expected at most 1e\+08 samples, got 1000000000.0 s every 0.001 s, 1e\+12: shorten"
     ):
@@ -186,6 +188,7 @@ def test_absurd_sizes_are_refused():
         excitation.staircase(amplitude=1.0, levels=10**8, hold_time=1.0, sample_period=0.1)
     with pytest.raises(ValueError, match=r"expected at most 1e\+09 integration steps"):
         ehsvjax.simulate(tank(), tank_record(), substeps=10**9)
+    assert time.perf_counter() - began < 1.0
 
 
 @pytest.mark.parametrize(
