@@ -122,7 +122,7 @@ def _chance_instead(selection: Selection, beside: ProcessNoise) -> dict[tuple[in
     """
     bench, noise, found = selection.bench, selection.noise, {}
     required = {cause: need.required for cause, need in zip(selection.included, selection.needs, strict=True)}
-    for causes in dict.fromkeys([*((cause,) for cause in required), tuple(required)] if required else ()):
+    for causes in filter(None, dict.fromkeys([*((cause,) for cause in required), selection.included])):
         rest = tuple(j for j in required if j not in causes)
         start = with_only(bench, selection.final.points[0], rest)
         refitted = refit_set(selection.trials, start, rest, noise)
