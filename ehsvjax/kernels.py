@@ -22,6 +22,7 @@ import functools
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -55,6 +56,13 @@ _STORED_TOGETHER = 32
 # Blocks are filled up to whole vector registers, of 16 single-precision numbers at most. Narrower ones are compiled
 # differently, and round differently in the last bit.
 VECTOR = 16
+
+# Memory mappings of this process, of the 65,530 that Linux grants: without one more, XLA fails to load a program, and
+# dies of it where the program is to be cached. Programs of one length of record hold some hundred.
+_MAPPINGS = 40_000
+_MAPPED = Path("/proc/self/maps")
+# What `jit` has made: the functions whose programs can be released.
+_jitted: list[Any] = []
 
 # Primitives that XLA compiles inside one function. A sort, a scatter, or a call of a library cannot be there, nor can
 # sums and matrix products, which XLA may hand to a library if they are large enough.
@@ -92,14 +100,30 @@ def jit(function: Callable | None = None, **static) -> Callable:
     if function is None:
         return functools.partial(jit, **static)
     alone, within = jax.jit(function, compiler_options=_OPTIONS, **static), jax.jit(function, **static)
+    _jitted.append(alone)
 
     @functools.wraps(function)
     def called(*args, **kwargs):
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs)))
-        return (within if traced else alone)(*args, **kwargs)
+        if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+            return within(*args, **kwargs)
+        programs = alone._cache_size()
+        results = alone(*args, **kwargs)
+        if alone._cache_size() > programs:
+            _release_programs()
+        return results
 
     called.lower = alone.lower  # type: ignore[attr-defined]
     return called
+
+
+def _release_programs() -> None:
+    """Forget the programs of all that `jit` has made, once this process holds many memory mappings.
+
+    A loop over hundreds of records, each of a length of its own, comes there; what is used again is compiled again.
+    """
+    if _MAPPED.exists() and len(_MAPPED.read_bytes().splitlines()) > _MAPPINGS:
+        for function in _jitted:
+            function.clear_cache()
 
 
 def one_kernel(function: Callable) -> Callable:

@@ -219,3 +219,23 @@ def test_without_the_kernels_all_is_the_same_but_slower():
     for plain in (run("lacking"), run(EHSVJAX_PLAIN_KERNELS="1")):
         assert plain[0] == "1"
         assert float(plain[1]) == pytest.approx(float(cost), rel=1e-6)
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/maps"), reason="memory mappings are counted on Linux alone")
+def test_a_loop_over_records_of_many_lengths_keeps_to_its_memory_mappings(monkeypatch):
+    def mappings():
+        with open("/proc/self/maps", "rb") as file:
+            return len(file.readlines())
+
+    def most_beyond_the_start(more):
+        start = most = mappings()
+        monkeypatch.setattr(kernels, "_MAPPINGS", start + more)
+        total = kernels.jit(lambda values: jnp.sin(values).cumsum()[-1] + jnp.cos(values) @ values)
+        for length in range(1, 40):
+            values = np.linspace(0.0, 1.0, length, dtype=np.float32)
+            np.testing.assert_allclose(total(values), np.sin(values).sum() + np.cos(values) @ values, rtol=1e-5)
+            most = max(most, mappings())
+        return most - start
+
+    assert most_beyond_the_start(10_000) > 80
+    assert most_beyond_the_start(40) < 60
