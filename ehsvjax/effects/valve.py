@@ -1,6 +1,7 @@
 """Effects of a servovalve and its actuator, and of the Van der Pol oscillator's damping."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from ehsvjax.effects.effect import (
     Effect,
@@ -171,7 +172,17 @@ VALVE = (
     Effect(
         "oil_compressibility",
         "capacitance",
-        (size("capacitance", "{value}", constant(1e-15), constant(1e-9)),),
+        # The oil rings after each stroke: what is a fifth off has another frequency, and explains nothing of it.
+        (
+            EffectParameter(
+                "capacitance",
+                "{value}",
+                0.0,
+                constant(0.0),
+                constant(1e-9),
+                lambda s: np.geomspace(1e-15, 1e-11, 36),
+            ),
+        ),
         lambda own, capacitance, context: capacitance + own["capacitance"],
         says="the oil is compressed before the piston moves",
         settled_by="measure the load pressure through fast steps",

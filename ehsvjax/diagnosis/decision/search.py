@@ -351,9 +351,7 @@ def _next_effect(stage: Stage) -> Stage | None:
     hopeful = [
         s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
     ]
-    # What each record has for itself explains anything that differs between them: what all share comes first.
-    shared = [s for s in hopeful if not bench.of_each(s.candidate)]
-    return _best_of(stage, shared) or _best_of(stage, [s for s in hopeful if bench.of_each(s.candidate)])
+    return _best_of(stage, hopeful)
 
 
 def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
