@@ -101,7 +101,7 @@ def _names_of(model: Model, reporting: Equations) -> list[str]:
         return reporting.measure(values, model.start(values, initial, inputs), inputs, identity)
 
     # Shapes only, no values: there is none that every parameter can have (an area, less all of it, divides by zero).
-    number = jnp.zeros(())
+    number = jax.ShapeDtypeStruct((), jnp.float32)
     values = {p.name: number for p in model.parameters}
     initial = {p.name: number for p in model.initial}
     traced = jax.eval_shape(outputs, values, initial, dict.fromkeys(model.inputs, number))

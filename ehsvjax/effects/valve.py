@@ -180,7 +180,7 @@ VALVE = (
                 0.0,
                 constant(0.0),
                 constant(1e-9),
-                lambda s: np.geomspace(1e-15, 1e-11, 36),
+                lambda s: np.geomspace(1e-15, 1e-11, 36).tolist(),
             ),
         ),
         lambda own, capacitance, context: capacitance + own["capacitance"],
