@@ -101,14 +101,15 @@ def jit(function: Callable | None = None, **static) -> Callable:
         return functools.partial(jit, **static)
     alone, within = jax.jit(function, compiler_options=_OPTIONS, **static), jax.jit(function, **static)
     _jitted.append(alone)
+    count = getattr(alone, "_cache_size", lambda: 0)
 
     @functools.wraps(function)
     def called(*args, **kwargs):
         if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves((args, kwargs))):
             return within(*args, **kwargs)
-        programs = alone._cache_size()
+        programs = count()
         results = alone(*args, **kwargs)
-        if alone._cache_size() > programs:
+        if count() > programs:
             _release_programs()
         return results
 
