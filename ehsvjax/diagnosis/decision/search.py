@@ -26,7 +26,7 @@ from ehsvjax.diagnosis.decision.trials import (
     refit_sets,
     trials_of,
 )
-from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, responses_at, screen
+from ehsvjax.diagnosis.hypotheses.screening import Screening, responses_at, screen
 
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
@@ -343,7 +343,7 @@ def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: No
 
 
 def _next_effect(stage: Stage) -> Stage | None:
-    """Return the next look, with one effect more, or none if no effect is significant or there are enough."""
+    """Return the next look, with the effect more that explains most; none if none gains enough, or there are enough."""
     if len(stage.included) == _MOST_EFFECTS:
         return None
     trials = stage.trials
@@ -351,13 +351,6 @@ def _next_effect(stage: Stage) -> Stage | None:
     hopeful = [
         s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
     ]
-    return _best_of(stage, hopeful)
-
-
-def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
-    """Return the next look with the one of some effects that explains most, or none if none gains enough."""
-    trials = stage.trials
-    bench = trials.bench
     best: Stage | None = None
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
