@@ -156,8 +156,8 @@ def test_a_record_may_hold_outputs_that_another_does_not(held):
 @pytest.mark.thorough
 @of_the_servovalve
 def test_what_each_record_has_for_itself_competes_with_what_all_share():
-    # A bias that both share explains a part of two drifts, and two frictions some more: there was no room left for the
-    # drift, and no end of the refits of what stood in its place.
+    # A bias that both share explains a part of two drifts, and a friction some more: these came before the drift, and
+    # their rivals' refits had no end.
     drift, records = {"drift": 3.745e-4}, []
     for k, (count, supply_pressure) in enumerate([(25, 140e5), (15, 70e5)]):
         command = held_levels(np.random.default_rng([6, k]), 6e-3, count, 200)
