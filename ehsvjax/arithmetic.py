@@ -11,7 +11,6 @@ from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
@@ -62,7 +61,7 @@ def outputs_of(
     problem: Problem, individual: Float[np.ndarray, " parameter"]
 ) -> Float[np.ndarray, "record time signal"]:
     """Return the outputs of one individual, in their units, in float64."""
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         return np.asarray(_outputs(cast(problem, jnp.float64), np.asarray(individual, np.float64)))
 
 

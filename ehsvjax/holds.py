@@ -9,10 +9,11 @@ line is off by 53 and 79 %.
 import functools
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from ehsvjax import kernels
 
 HOLDS = ("zero", "linear", "band-limited")
 """From the least to the most that has to be known of an input between its samples."""
@@ -87,7 +88,7 @@ def following(series: Array) -> Array:
 def interpolated(values: Float[np.ndarray, " time"], place: Float[np.ndarray, " place"]) -> Float[np.ndarray, " place"]:
     """Return a band-limited input at places that are counted in samples."""
     start = np.minimum(np.floor(place).astype(int), len(values) - 1)
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         periods = course(jnp.asarray(values)[:, None], None, "band-limited")
     return np.asarray(between(tuple(np.asarray(c)[start, 0] for c in periods), place - start))
 

@@ -294,28 +294,26 @@ def simulated(problem: Problem, individual: Float[Array, " parameter"]) -> Float
     """Observed outputs of one individual on every record, in their units."""
 
     def keep(carry, outputs, sample):
-        return carry, jnp.stack([outputs[name] for name in problem.observed])
+        return carry, [outputs[name] for name in problem.observed]
 
-    def trajectories(individual):
-        parameters, own = _split(problem, individual)
-        trajectory = functools.partial(_scan, problem, parameters, visit=keep, carry=None, rest=None)
-        return jax.vmap(lambda own, samples: trajectory(own, samples)[1])(own, problem.samples)
+    def trajectory(own, samples):
+        return jnp.stack(_scan(problem, parameters, own, samples, keep, None, None)[1], axis=-1)
 
-    return trajectories(individual)
+    parameters, own = _split(problem, individual)
+    return jax.vmap(trajectory)(own, problem.samples)
 
 
 def _record_cost(problem: Problem, parameters, own, samples: Samples):
-    scale = 1.0 / jnp.sqrt(problem.noise_variance)
+    scale = list(1.0 / jnp.sqrt(problem.noise_variance))
 
     def accumulate(total, outputs, sample):
-        measured_outputs, measured = sample
-        for i, name in enumerate(problem.observed):
-            square = robust_square(scale[i] * (measured_outputs[i] - outputs[name]), problem.huber)
-            total = total + jnp.where(measured[i], square, 0.0)
+        for name, per_deviation, (reading, measured) in zip(problem.observed, scale, sample, strict=True):
+            square = robust_square(per_deviation * (reading - outputs[name]), problem.huber)
+            total = total + jnp.where(measured, square, 0.0)
         return total, None
 
     zero = jnp.zeros((), samples.outputs.dtype)
-    rest = (samples.outputs, samples.measured)
+    rest = [(samples.outputs[:, i], samples.measured[:, i]) for i in range(len(scale))]
     return _scan(problem, parameters, own, samples, accumulate, zero, rest, _scan_by_parts)[0]
 
 
@@ -323,26 +321,30 @@ def _scan_by_parts(body: Callable, carry: Any, samples: Any):
     """Scan with a state and a sum; the sum starts anew for every few samples, and the sums are added with compensation.
 
     In float32 a plain sum over a million samples would lose its last digits, and compensating each sample costs a tenth
-    of the whole simulation. The samples that fill up the last part are not measured.
+    of the whole simulation on a CPU. The samples that fill up the last part are not measured.
     """
     count = len(jax.tree.leaves(samples)[0])
     parts = -(-count // _SUMMED_TOGETHER)
     length = -(-count // parts)
 
     def by_part(leaf):
-        filled = jnp.pad(leaf, [(0, parts * length - count)] + [(0, 0)] * (leaf.ndim - 1))
-        return filled.reshape(parts, length, *leaf.shape[1:])
+        return jnp.pad(leaf, (0, parts * length - count)).reshape(parts, length)
 
-    def one_part(carry, samples):
+    def whole_part(both, samples):
+        return lax.scan(body, both, samples)[0], None
+
+    def compensated(carry, samples):
         state, total, lost = carry
-        (state, part), _ = lax.scan(body, (state, jnp.zeros_like(total)), samples)
+        (state, part), _ = one_part((state, jnp.zeros_like(total)), samples)
         # Kahan (1965): what the last addition lost is taken off the next term.
         term = part - lost
         following = total + term
         return (state, following, (following - total) - term), None
 
+    one_part = body if kernels.in_registers() else whole_part
+    samples = samples if kernels.in_registers() else jax.tree.map(by_part, samples)
     state, total = carry
-    (state, total, _), _ = kernels.scan(one_part, (state, total, jnp.zeros_like(total)), jax.tree.map(by_part, samples))
+    (state, total, _), _ = kernels.scan(compensated, (state, total, jnp.zeros_like(total)), samples)
     return (state, total), None
 
 

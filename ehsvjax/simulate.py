@@ -72,7 +72,7 @@ def simulate(
     start = changed(model, "initial conditions", {p.name: p.value for p in model.initial}, initial)
     grid = grid_of(model, record, substeps)
     inputs = input_array(model, record)
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         as_scalars = functools.partial(jax.tree.map, jnp.float64)
         outputs = _simulate(
             model.equations,
@@ -208,12 +208,11 @@ def scan_model(
 
     """
     given = course(inputs, holds, grid.hold)
-    periods = given, _prepared(equations, grid, parameters, given, holds, sample_period)
+    periods = {name: tuple(c[:, i] for c in given) for i, name in enumerate(equations.inputs)}
+    periods |= _prepared(equations, grid, parameters, given, holds, sample_period)
 
     def inputs_at(here, fraction):
-        given, changed = here
-        every = dict(zip(equations.inputs, between(given, fraction), strict=True))
-        return every | {name: between(course, fraction) for name, course in changed.items()}
+        return {name: between(course, fraction) for name, course in here.items()}
 
     def inputs_of(sample):
         return functools.partial(inputs_at, sample[0])

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ehsvjax import genetic
+from ehsvjax import genetic, kernels
 from ehsvjax.arithmetic import ROUGHLY, settled_at
 from ehsvjax.checks import by_name, number
 from ehsvjax.doubts import NO_CHANGE, residuals_at
@@ -69,7 +69,7 @@ def guessed(problem: Problem, model: Model, start: Any) -> Float[np.ndarray, " p
 def compile_refinement(problem: Problem, starts: int) -> threading.Thread:
     """Trace the refinement, and have it compiled while the search is traced and compiled, on another core."""
     count = starts + bool(problem.free_initial)
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         nowhere = np.zeros((count, problem.unknowns))
         traced = refine.lower(cast(problem, jnp.float64), jnp.asarray(nowhere), held=jnp.asarray(nowhere > 0))
     # What is compiled is kept by the traced program itself, of which JAX keeps one for the same shapes.
@@ -122,7 +122,7 @@ def refine_and_reweigh(problem: Problem, starts, *, reweigh: bool) -> tuple[Refi
     asked = problem.samples
     own, nominal_initial = len(problem.free), np.asarray(starts)[-1, len(problem.free) :]
     problem = settled_at(problem, np.asarray(starts[0]), ROUGHLY)
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         refined = _off_plateaus(problem, _refined(problem, starts))
         agreeing = _agreeing(problem, refined)
         weighed = len(problem.observed) > 1 or problem.huber is not None or problem.priors is not None

@@ -110,6 +110,7 @@ NEVER = {
     "models.van_der_pol": ("population", "genetic", "operators", "identify", "record"),
     "integrators": ("models", "population", "genetic", "record", "kernels"),
     "kernels": ("models", "population", "genetic", "record", "simulate"),
+    "registers": ("kernels", "models", "population", "genetic", "record", "simulate"),
     "simulate": ("population", "genetic", "operators", "identify"),
     "population": ("genetic", "operators", "search", "identify", "fit"),
     "operators": ("population", "models", "record", "genetic", "simulate"),

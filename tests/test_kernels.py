@@ -189,6 +189,26 @@ def test_device_that_the_user_chose_is_heeded():
         assert kernels._shaped()
 
 
+def test_double_precision_stays_on_the_cpu(monkeypatch):
+    with kernels.double_precision():
+        assert jnp.asarray(1.0).dtype == jnp.float64
+        assert jax.config.jax_default_device is None
+    monkeypatch.setattr(kernels, "_platform", lambda: "gpu")
+    with kernels.double_precision():
+        assert jnp.asarray(1.0).dtype == jnp.float64
+        assert jax.config.jax_default_device == jax.local_devices(backend="cpu")[0]
+    assert jax.config.jax_default_device is None
+
+    def absent(backend):
+        raise RuntimeError(f"Unknown backend {backend}")
+
+    monkeypatch.setattr(jax, "local_devices", absent)
+    with kernels.double_precision():
+        assert jnp.asarray(1.0).dtype == jnp.float64
+        assert jax.config.jax_default_device is None
+    assert jnp.asarray(1.0).dtype == jnp.float32
+
+
 _IN_ANOTHER_PROCESS = """
 import sys, warnings
 if "lacking" in sys.argv:

@@ -153,7 +153,7 @@ _FORMS = (_held_levels, _two_levels, _staircase, _triangles, _multisine, _steps_
 
 def realised(genes: Float[np.ndarray, " gene"], time, reach: Reach) -> Float[np.ndarray, " time"]:
     """Return the command in float64, as a rig is given it."""
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         return np.asarray(_command(*jax.tree.map(jnp.float64, (genes, time, reach))))
 
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ehsvjax import kernels
 from ehsvjax.fit import Fit
 from ehsvjax.population import Problem, cast, in_units, simulated, to_unit
 from ehsvjax.precision.of_fit import prepared
@@ -189,6 +190,6 @@ def refitted_cost(
     ]
     unit = np.clip(to_unit(problem.coordinates, np.array(values)), 0.0, 1.0)[None]
     problem = replace(problem, substeps=_finer(problem, fit), samples=problem.samples._replace(measured=measured))
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         nothing = jnp.asarray(np.zeros(unit.shape, bool))
         return float(refine(cast(problem, jnp.float64), jnp.asarray(unit), held=nothing).cost[0])

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ehsvjax import kernels
 from ehsvjax.checks import by_name, instance, number, refused
 from ehsvjax.effects.internal import watch_name, watched
 from ehsvjax.linear.limit import continuous
@@ -65,7 +66,7 @@ def linearise(
     added = [name for name in acting if name not in model.inputs]
     equations = watched(model.equations, model.max_step)
     reported = tuple(name if name in model.outputs else watch_name(name) for name in seen)
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         as_scalars = functools.partial(jax.tree.map, jnp.float64)
         constants, constant_inputs = as_scalars(values), as_scalars(held)
         state = real_state(equations.start(constants, as_scalars(start), constant_inputs))

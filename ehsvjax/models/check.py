@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax import kernels
 from ehsvjax.models.model import Equations, Model
 from ehsvjax.structures import in_words, is_numeric, name_of, same_structure
 
@@ -81,7 +82,7 @@ def _checked(
     def whole(parameters, initial, inputs, series, step_size):
         return one_step(model, equations, signal, parameters, initial, inputs, series, step_size)
 
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         scalar = jax.ShapeDtypeStruct((), jnp.float64)
         series = dict.fromkeys(equations.inputs, jax.ShapeDtypeStruct((_SAMPLES, 3), jnp.float64))
         names = (parameters, initial, equations.inputs)
@@ -171,7 +172,7 @@ def where_not_finite(
         step_size: s.
 
     """
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         numbers, begin, first, series, step_size = jax.tree.map(
             jnp.float64, (parameters, initial, dict(zip(model.inputs, inputs[0], strict=True)), inputs, step_size)
         )

@@ -159,7 +159,7 @@ def bootstrap(
         # What is known beforehand is a reading too, and drawn anew as they are.
         off = np.where(np.isfinite(problem.priors.deviation), problem.priors.deviation, 0.0)
         known = values + off * random.standard_normal((draws, len(values)))
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         drawn_anew = jnp.asarray(drawn), None if known is None else jnp.asarray(known)
         individuals, converged = _refits(cast(problem, jnp.float64), drawn_anew, jnp.asarray(start))
     refitted, good = to_values(problem.coordinates, np.asarray(individuals)), np.asarray(converged)

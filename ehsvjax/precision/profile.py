@@ -7,11 +7,11 @@ import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ehsvjax import kernels
 from ehsvjax.population import Problem, cast, to_unit, to_values
 from ehsvjax.precision.standard_errors import quantile_of
 from ehsvjax.refine import refine
@@ -123,7 +123,7 @@ def profile_likelihood(
     distances = _DISTANCES * quantile / 1.96
     for _ in range(_ROUNDS):
         starts, masks = _starts(problem, values, best, covariance, seen, names, distances)
-        with jax.enable_x64(True):
+        with kernels.double_precision():
             costs = _refitted(cast(problem, jnp.float64), starts, masks, together)
         # The first start is the fit itself, nothing held.
         least = float(costs[0]) if np.isnan(least) else least

@@ -62,7 +62,7 @@ def sensitivities(problem: Problem, values: Float[np.ndarray, " parameter"]) -> 
     """Return the sensitivities at values of the unknowns, SI; the problem's arrays are NumPy's."""
     lower, upper = problem.coordinates.lower, problem.coordinates.upper
     width = upper - lower
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         y, jacobian = _simulated_and_jacobian(
             cast(replace(problem, coordinates=in_units(width)), jnp.float64), jnp.asarray(values / width)
         )

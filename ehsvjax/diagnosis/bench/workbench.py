@@ -184,7 +184,7 @@ class Workbench:
                 added = np.array(added)
                 added[: len(some)] += disturbances[first : first + ABREAST]
             # The setting is that of a thread.
-            with jax.enable_x64(True):
+            with kernels.double_precision():
                 filled = jnp.asarray(_filled(some, ABREAST))
                 acting = replace(problem, known=problem.known | self._acting(some))
                 outputs = _simulated(acting, filled, jnp.asarray(added))
@@ -212,7 +212,7 @@ class Workbench:
     @functools.cached_property
     def _always_added(self) -> Float[Array, "individual record time place"]:
         """What is added to signals in every simulation, side by side; to copy it takes as long as some simulations."""
-        with jax.enable_x64(True):
+        with kernels.double_precision():
             return jnp.asarray(np.repeat(self.disturbances[None], ABREAST, axis=0))
 
     @functools.cached_property
@@ -221,7 +221,7 @@ class Workbench:
 
         How many integration steps a sample had in the fit is nothing that another program has to be compiled for.
         """
-        with jax.enable_x64(True):
+        with kernels.double_precision():
             return cast(replace(self.problem, grid=self.problem.grid._replace(substeps=1)), jnp.float64)
 
     def stepped(self, points: Float[np.ndarray, "individual parameter"]) -> arithmetic.OutputsAt:

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ehsvjax import kernels
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import Parts, parts_at
 from ehsvjax.diagnosis.bench.refits import Refits, unexplained
@@ -164,7 +165,7 @@ def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
     def added(own, value, along):
         return candidate.effect.apply(own, value, along | always) - value
 
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         every_time = jax.vmap(jax.vmap(added, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
         every = jax.vmap(
             every_time, in_axes=({n.name: 0 if n.name == "frequency" else None for n in numbers}, None, None)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ehsvjax import kernels
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Candidate, Effect
@@ -92,7 +93,7 @@ def _run(bench: Workbench, candidate: Candidate, own) -> tuple[np.ndarray, np.nd
     context = {} if at_input or constant else bench.internal.contexts[signal]
     along = {"time": np.arange(count) * period} | {name: series[0, :count] for name, series in context.items()}
     held = {"duration": count * period, "step_size": period, "sample_period": period}
-    with jax.enable_x64(True):
+    with kernels.double_precision():
         own = {name: jnp.float64(number) for name, number in own.items()}
         value = jnp.asarray(series)
         if at_input:
