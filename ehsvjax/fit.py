@@ -463,7 +463,6 @@ class Fit:
             OSError: if the file is not there or may not be read.
 
         """
-        from ehsvjax.effects import BANK
         from ehsvjax.storage import load_fit
 
-        return load_fit(path, model, BANK if bank is None else bank)
+        return load_fit(path, model, bank)

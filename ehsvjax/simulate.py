@@ -218,7 +218,7 @@ def scan_model(
         return functools.partial(inputs_at, sample[0])
 
     def visit_state(carry, state, sample):
-        here, rest = sample
+        here, rest, _ = sample
         return visit(carry, equations.measure(parameters, state, inputs_at(here, 0.0), signal), rest)
 
     step = equations.stepper(parameters, sample_period / grid.substeps, signal)
@@ -228,7 +228,9 @@ def scan_model(
     # stays one.
     state = jax.tree.map(lambda leaf: leaf if _is_count(leaf) else jnp.asarray(leaf, inputs.dtype), state)
     step = repeated(step, grid.substeps)
-    return scan_samples(step, state, visit_state, carry, (periods, samples), inputs_of, scan)
+    # A model without inputs runs as many samples all the same.
+    counted = None if periods else jnp.zeros(len(inputs), inputs.dtype)
+    return scan_samples(step, state, visit_state, carry, (periods, samples, counted), inputs_of, scan)
 
 
 def _prepared(equations, grid, parameters, given, holds, sample_period) -> dict[str, tuple[Array, ...]]:

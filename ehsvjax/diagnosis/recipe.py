@@ -42,7 +42,7 @@ def diagnose(
     validation: Record | Sequence[Record] | None = None,
     *,
     key: Key[Array, ""],
-    bank: Sequence[Effect] = BANK,
+    bank: Sequence[Effect] | None = None,
     progress: bool | None = None,
 ) -> Diagnosis:
     """Say what a fitted model gets wrong on records, name the cause, extend the model and measure the gain.
@@ -60,7 +60,7 @@ def diagnose(
         validation: other records, on which the gain is measured; by default each of several records is predicted from
             the others, and the last 30% of a single one are held back.
         key: random key, `jax.random.key(0)`, for the intervals of the gain.
-        bank: the candidate effects.
+        bank: the candidate effects; by default `ehsvjax.effects.BANK`.
         progress: show a bar with the stage and the time that is left; by default in a terminal or a notebook.
 
     Raises:
@@ -69,7 +69,7 @@ def diagnose(
             twice.
 
     """
-    bank = _check_bank(bank)
+    bank = _check_bank(BANK if bank is None else bank)
     measured = checked_records(records)
     unseen = () if validation is None else checked_records(validation, "validation")
     _check(fit, measured, unseen, key, progress)

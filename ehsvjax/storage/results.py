@@ -25,7 +25,7 @@ def save_fit(fit: Fit, path: str | os.PathLike) -> None:
     _save(fit, path)
 
 
-def load_fit(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] = BANK) -> Fit:
+def load_fit(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] | None = None) -> Fit:
     """Read a fit that `save_fit` wrote, of this or of an older version; see `Fit.load`.
 
     Raises:
@@ -33,7 +33,7 @@ def load_fit(path: str | os.PathLike, model: Model | None = None, bank: Sequence
         OSError: if the file is not there or may not be read.
 
     """
-    _check_handed(model, bank)
+    bank = _check_handed(model, bank)
     if version_1.is_version_1(path):
         return version_1.load_fit(path, model)
     return _load(path, Fit, "a fit written by Fit.save", model, bank)
@@ -44,7 +44,9 @@ def save_diagnosis(diagnosis: "Diagnosis", path: str | os.PathLike) -> None:
     _save(diagnosis, path)
 
 
-def load_diagnosis(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] = BANK) -> "Diagnosis":
+def load_diagnosis(
+    path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] | None = None
+) -> "Diagnosis":
     """Read a diagnosis that `save_diagnosis` wrote; see `Diagnosis.load`.
 
     Raises:
@@ -54,7 +56,7 @@ def load_diagnosis(path: str | os.PathLike, model: Model | None = None, bank: Se
     """
     from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 
-    _check_handed(model, bank)
+    bank = _check_handed(model, bank)
     return _load(path, Diagnosis, "a diagnosis written by Diagnosis.save", model, bank)
 
 
@@ -63,10 +65,10 @@ def _save(result: Any, path: str | os.PathLike) -> None:
     write_sealed(path, type(result).__name__, {"objects": tree.objects}, tree.arrays)
 
 
-def _check_handed(model: Any, bank: Any) -> None:
+def _check_handed(model: Any, bank: Any) -> tuple[Effect, ...]:
     if model is not None:
         instance("model", model, Model, "hand over the model that was fitted, or none for one of this package")
-    several("bank", bank, Effect, "hand over (*ehsvjax.effects.BANK, my_effect)")
+    return several("bank", BANK if bank is None else bank, Effect, "hand over (*ehsvjax.effects.BANK, my_effect)")
 
 
 def _load(path: str | os.PathLike, kind: type, what: str, model: Model | None, bank: Sequence[Effect]) -> Any:

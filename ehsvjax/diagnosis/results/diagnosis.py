@@ -13,7 +13,6 @@ from ehsvjax.diagnosis.results.causes import Cause, Left
 from ehsvjax.diagnosis.results.explanations import Explanation
 from ehsvjax.diagnosis.results.gain import Gain
 from ehsvjax.diagnosis.results.misfit import Misfit
-from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
@@ -187,7 +186,7 @@ class Diagnosis:
         save_diagnosis(self, path)
 
     @staticmethod
-    def load(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] = BANK) -> "Diagnosis":
+    def load(path: str | os.PathLike, model: Model | None = None, bank: Sequence[Effect] | None = None) -> "Diagnosis":
         """Read a diagnosis that `save` wrote: it prints, draws and reports the same.
 
         Args:
