@@ -4,6 +4,7 @@ Some of the effects of each model are hidden in turn, and one that is drawn afre
 as benchmarks/diagnosis.py does at three noise levels.
 """
 
+import math
 import os
 import secrets
 
@@ -61,7 +62,12 @@ def held(found: Diagnosis) -> set[str]:
 
 def check_found(hidden: Hidden) -> None:
     found, seen, said = diagnosed(hidden)
-    if found.verdict == "adequate":
+    (made,) = records([hidden], SAMPLES[hidden.model])
+    frequency = made.sizes[hidden.names[0]].get("frequency", math.inf)
+    if frequency * made.time[-1] < 4.0 * math.pi and hidden.names[0] not in held(found):
+        # What a record does not show twice is not known to be periodic: it is none of the bank's harmonics.
+        assert found.verdict == "unexplained", said
+    elif found.verdict == "adequate":
         assert seen < PLAIN, said
     else:
         assert found.verdict in ("named", "ambiguous"), said
@@ -97,6 +103,18 @@ def test_an_effect_of_the_servovalve_is_found(name):
 def test_an_effect_drawn_afresh_is_found(model):
     name = known(model)[FRESH % len(known(model))]
     check_found(Hidden(model, "white", VARIANCE[model], (name,), FRESH))
+
+
+@of_the_oscillator
+@pytest.mark.parametrize(
+    ("name", "seed"),
+    [("harmonic_force", 1487285032), pytest.param("parametric_excitation", 2427082, marks=pytest.mark.thorough)],
+)
+def test_what_is_not_shown_twice_is_a_force_along_time_and_no_other_harmonic(name, seed):
+    found, _, said = diagnosed(Hidden("van_der_pol", "white", VARIANCE["van_der_pol"], (name,), seed))
+    assert found.verdict == "unexplained", said
+    assert found.missing is not None, said
+    assert (found.missing.place, found.missing.quantity) == ("force", "time"), said
 
 
 @pytest.mark.parametrize(

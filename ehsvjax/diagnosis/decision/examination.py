@@ -81,10 +81,11 @@ def examine(selection: Selection) -> Examination:
     elif innocent:
         # Then all of it tells of the noise, and more than what lies outside all responses.
         selection = replace(selection, noise=noise_of_all_left(bench, selection.final))
-    instead = _instead(selection, before, innocent)
-    return Examination(
-        selection, before, after, innocent, undecided and repeated is None, chance, chance_behind, *instead
-    )  # fmt: skip
+    instead, lacking = _instead(selection, before, innocent and chance is None)
+    if lacking and chance is not None:
+        innocent = False
+    still_open = undecided and repeated is None
+    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, instead, lacking)
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
@@ -158,7 +159,8 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     """Return a term of free form that explains the record as well as all causes together, and whether better.
 
     It is not better if the causes predict the unused data of any record better: what follows any data that it is
-    refitted to must at least predict. What depends on time alone does not: no other record would have it.
+    refitted to must at least predict. What depends on time alone does not: no other record would have it. It is better
+    than causes of which one is of this run alone too: it is the general form of those.
     """
     causes = selection.included
     if not before or not causes or (innocent and len(causes) == 1):
@@ -167,8 +169,12 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
     better = noise.gained(selection.final.residual[0], term.residual)
     better += sum(_price(selection, i) for i in causes)
-    if term.quantity == TIME or not better > float(np.log(noise.measured.sum())) * term.pieces + INSEPARABLE:
+    of_run = any(bench.candidates[i].effect.of_run for i in causes)
+    price = float(np.log(noise.measured.sum())) * term.pieces
+    if (term.quantity == TIME and not of_run) or not better > price + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
+    if term.quantity == TIME:
+        return term, True
     with_it = nominal._replace(residual=term.residual[None])
     unused = predicted(bench, [()], [with_it], noise, lambda known: told_by(bench, nominal, known, curve))
     contradicted = [
