@@ -116,7 +116,7 @@ OTHER_INPUT = ehsvjax.Record(TIME, {"voltage": np.sign(np.sin(TIME))}, POSITION,
         ({"bank": ()}, "(?=.*got)expected bank to be a sequence of effects, such as"),
         ({"bank": (*BANK, "sensor_bias")}, "(?=.*got)expected bank to be a sequence of effects, such as"),
         ({"bank": BANK[0]}, "(?=.*got)expected bank to be a sequence of effects, such as"),
-        ({"bank": None}, "(?=.*got)expected bank to be a sequence of effects, such as"),
+        ({"bank": "coulomb_friction"}, "(?=.*got)expected bank to be a sequence of effects, such as"),
     ],
 )
 def test_what_cannot_be_diagnosed_is_refused_before_anything_is_compiled(fit, record, changes, said):
