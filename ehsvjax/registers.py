@@ -1,8 +1,8 @@
 """How a time loop becomes fast on a GPU: one kernel, a thread for each individual, the state in its registers.
 
-XLA launches a kernel for every step of a loop, at some us each, and carries the state through the GPU's memory in
-between. Here the loop is inside the kernel (Pallas, lowered to Triton): an individual's state, its parameters and its
-sum of squares never leave its thread, and the record is read from the cache that all threads share.
+XLA launches a kernel or more for every step of a loop, at 30 to 40 us a step, and carries the state through the GPU's
+memory in between. Here the loop is inside the kernel (Pallas, lowered to Triton): an individual's state, its parameters
+and its sum of squares never leave its thread, and the record is read from the cache that all threads share.
 
 Axis legend: lane, the individuals, and for a derivative its directions beside them; time.
 """
@@ -266,9 +266,8 @@ def _evaluate(jaxpr: Jaxpr, constants: Sequence[Any], *args) -> list[Any]:
             params = dict(equation.params)
             for (parameter, place), one in inner.items():
                 with_nan = jax.make_jaxpr(functools.partial(_evaluate, one.jaxpr, one.consts))(*one.in_avals)
-                whole = params[parameter]
-                params[parameter] = with_nan if place is None else _placed(whole, [place], [with_nan])
-            params = {key: tuple(v) if isinstance(v, list) else v for key, v in params.items()}
+                several = place is not None
+                params[parameter] = tuple(_placed(params[parameter], [place], [with_nan])) if several else with_nan
             found = equation.primitive.bind(*operands, **params)
             results = found if equation.primitive.multiple_results else [found]
         values.update(zip(equation.outvars, results, strict=True))
