@@ -11,7 +11,7 @@ from ehsvjax.checks import flag
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.progress import bar as progress_bar
 from ehsvjax.diagnosis.bench.setup import workbench
-from ehsvjax.diagnosis.bench.workbench import Workbench
+from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
 from ehsvjax.diagnosis.decision.examination import Examination, examine, remaining_term
 from ehsvjax.diagnosis.decision.search import select
 from ehsvjax.diagnosis.decision.verdict import verdict_of
@@ -186,5 +186,4 @@ def _without_spikes(bench: Workbench) -> tuple[Workbench, Bool[np.ndarray, "reco
     samples = bench.problem.samples
     residual = samples.outputs - bench.simulated(bench.nominal[None])[0]
     alone = spikes(residual, samples.measured, samples.outputs)
-    kept = samples._replace(measured=samples.measured & ~alone)
-    return replace(bench, problem=replace(bench.problem, samples=kept)), alone
+    return with_readings(bench, samples.measured & ~alone), alone

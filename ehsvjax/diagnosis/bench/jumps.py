@@ -6,14 +6,12 @@ by a microsecond seems to be there. Such a reading is not straight within the er
 no weight. A smooth bend has neighbours that bend as well.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from ehsvjax.arithmetic import LEFT_OUT, few
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits
-from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench, with_readings
 from ehsvjax.readings import standing_out
 
 # Standard errors of the unknowns over which a jump is looked for: of many jumps a third lie beyond one of them. And
@@ -59,5 +57,4 @@ def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
     # More than that no jump bends.
     if not jumping.any() or not few(jumping, samples.measured, LEFT_OUT):
         return bench
-    straight = samples._replace(measured=samples.measured & ~jumping)
-    return replace(bench, problem=replace(bench.problem, samples=straight))
+    return with_readings(bench, samples.measured & ~jumping)

@@ -327,6 +327,21 @@ def settled(
     return replace(bench, problem=problem, sketched_at=rough.substeps)
 
 
+def with_readings(bench: Workbench, measured: Bool[np.ndarray, "record time signal"]) -> Workbench:
+    """Return the bench with these readings and no others."""
+    samples = bench.problem.samples._replace(measured=measured)
+    return replace(bench, problem=replace(bench.problem, samples=samples))
+
+
+def same_readings(bench: Workbench, other: Workbench) -> bool:
+    """Whether two benches have the same readings and steps."""
+    return (
+        np.array_equal(bench.problem.samples.measured, other.problem.samples.measured)
+        and bench.problem.substeps == other.problem.substeps
+        and bench.sketched_at == other.sketched_at
+    )
+
+
 def _filled(rows, count):
     return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
 

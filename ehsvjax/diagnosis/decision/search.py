@@ -13,7 +13,7 @@ from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, not_made_up_for
-from ehsvjax.diagnosis.bench.workbench import Workbench, prepared, settled
+from ehsvjax.diagnosis.bench.workbench import Workbench, same_readings, settled, with_readings
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
 from ehsvjax.diagnosis.decision.trials import (
@@ -134,10 +134,9 @@ def select(bench: Workbench, progress: Progress) -> Selection:
         progress: told of each stage.
 
     """
-    begun, bench = bench, prepared(bench)
     progress("simulating every candidate", 0.15)
     trials = trials_of(bench, progress)
-    plain = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
+    plain = plain_noise(bench.problem.noise_variance, trials.bench.problem.samples.measured)
     stages = [_look(trials, (), refit_set(trials, bench.nominal, (), plain), plain)]
     while (found := _next_effect(stages[-1])) is not None:
         stages.append(found)
@@ -159,7 +158,7 @@ def select(bench: Workbench, progress: Progress) -> Selection:
             break
         if found is not None:
             weighed = _weighed(found, nominal)
-    return _selection(begun, stages, weighed)
+    return _selection(bench, stages, weighed)
 
 
 def without(selection: Selection, causes: Sequence[int]) -> Selection:
@@ -308,7 +307,9 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
 
 def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> Stage:
     """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest."""
-    trials, current = _known(trials, included, current, noise)
+    # Where jumps lie, and what arithmetic knows, is another matter for every explanation.
+    every = with_readings(trials.bench, trials.readings)
+    trials, current = _known(trials, every, included, current, noise)
     while True:
         bench = trials.bench
         measured = bench.problem.samples.measured
@@ -318,7 +319,7 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
         spanned = current.slopes[0], tried.changes, trials.terms.responses
         noise = noise_outside(current.residual[0], measured, spanned)
         before = trials
-        trials, current = _known(before, included, current, noise)
+        trials, current = _known(before, bench, included, current, noise)
         if trials is before:
             break
     if noise.coloured or noise.variances.size > 1:
@@ -330,15 +331,19 @@ def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noi
     return Stage(trials, included, current, noise, screen(bench, current, tried, noise, int(measured.sum()) // 2))
 
 
-def _known(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> tuple[Trials, Refits]:
-    """Return trials whose arithmetic knows a refit, and the refit there; both as they are if it does already."""
+def _known(
+    trials: Trials, bench: Workbench, included: tuple[int, ...], current: Refits, noise: Noise
+) -> tuple[Trials, Refits]:
+    """Return trials with those readings of a bench that are known at a refit, and the refit there.
+
+    Both as they are if these are the readings that they have.
+    """
     while True:
-        bench = trials.bench
-        known = without_jumps(_settled(bench, current.points, noise), current, noise)
-        if known is bench:
+        bench = without_jumps(_settled(bench, current.points, noise), current, noise)
+        if same_readings(bench, trials.bench):
             return trials, current
-        trials = trials._replace(bench=known)
-        only_known = plain_noise(noise.variances, known.problem.samples.measured)
+        trials = trials._replace(bench=bench)
+        only_known = plain_noise(noise.variances, bench.problem.samples.measured)
         current = refit_set(trials, current.points[0], included, only_known)
 
 

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit, span
-from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench, prepared
 from ehsvjax.diagnosis.hypotheses.curves import Terms, every_curve, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import Waves, waves_of
 from ehsvjax.diagnosis.hypotheses.screening import Screened
@@ -35,6 +35,7 @@ class Trials(NamedTuple):
         seen: what runs along the nominal model and varies, by name.
         terms: of free form, at all places, and what they would do to the outputs of the nominal model.
         waves: what harmonic effects would do, by the candidate's name.
+        readings: all that carry weight where arithmetic knows them and no jump is near: each look finds these itself.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
 
@@ -44,14 +45,17 @@ class Trials(NamedTuple):
     seen: dict[str, Float[np.ndarray, "record time"]]
     terms: Terms
     waves: dict[str, Waves]
+    readings: Bool[np.ndarray, "record time signal"]
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Progress
 
 
-def trials_of(bench: Workbench, progress: Progress) -> Trials:
+def trials_of(begun: Workbench, progress: Progress) -> Trials:
     """Simulate what terms of free form and harmonic ones would do; nothing has been refitted yet."""
+    bench = prepared(begun)
     seen = quantities(bench)
-    return Trials(bench, seen, terms_at(bench, bench.nominal, every_curve(bench, seen)), waves_of(bench), {}, progress)
+    terms = terms_at(bench, bench.nominal, every_curve(bench, seen))
+    return Trials(bench, seen, terms, waves_of(bench), begun.problem.samples.measured, {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:
