@@ -335,11 +335,9 @@ def with_readings(bench: Workbench, measured: Bool[np.ndarray, "record time sign
 
 def same_readings(bench: Workbench, other: Workbench) -> bool:
     """Whether two benches have the same readings and steps."""
-    return (
-        np.array_equal(bench.problem.samples.measured, other.problem.samples.measured)
-        and bench.problem.substeps == other.problem.substeps
-        and bench.sketched_at == other.sketched_at
-    )
+    steps = [(int(one.problem.substeps), one.sketched_at) for one in (bench, other)]
+    measured = [one.problem.samples.measured for one in (bench, other)]
+    return steps[0] == steps[1] and bool(np.array_equal(*measured))
 
 
 def _filled(rows, count):
