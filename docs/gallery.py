@@ -99,6 +99,7 @@ SIZES: dict[str, dict[str, float]] = {
     "input_bias": {"bias": 1e-4},
     "transport_delay": {"delay": 2e-3},
     "input_hold": {"share": 1.0},
+    "band_limited_input": {"share": 1.0},
     "input_lag": {"time_constant": 2e-3},
     "input_dead_zone": {"half_width": 3e-4},
     "input_saturation": {"limit": 4e-3},

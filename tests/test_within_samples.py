@@ -96,6 +96,26 @@ def test_an_input_runs_otherwise_within_its_samples(declared, share, truth):
     assert off("input_hold.share", share, response(*drawn(PUSH, truth)), declared) < 0.005
 
 
+@pytest.mark.parametrize("declared", ["zero", "linear"])
+def test_an_input_keeps_to_a_band_within_its_samples(declared):
+    frequencies, phases = np.random.default_rng(5).uniform([[0.02], [0.0]], [[0.65], [2.0]], (2, 12)) * np.pi
+
+    def push(samples):
+        return np.sin(samples[:, None] * frequencies + phases).sum(axis=1)
+
+    fine = np.arange(200 * FINER + 1) / FINER
+    truth = response(push(fine[:-1]), push(fine[1:]))
+    record = Record(PERIOD * np.arange(200), {"push": push(np.arange(200.0))}, hold=declared)
+    model = attach(VALVE, {"band_limited_input.share": (-1.0, 3.0)}, duration=10.0, bank=BANK)
+    held, smooth = (simulate(model, record, {"band_limited_input.share": share})["position"] for share in (0.0, 1.0))
+    # What comes before a record and after it is not known: its first samples and its last are not compared.
+    inside = slice(40, -20)
+    off_by, moved = (np.sqrt(np.mean((each - truth)[inside] ** 2)) / np.std(truth[inside]) for each in (smooth, held))
+    assert moved > 0.02
+    # As the smooth curve itself: right to 0.2 % up to 0.65 of half the sample rate.
+    assert off_by < 0.002
+
+
 @pytest.mark.parametrize("hold", ["zero", "linear"])
 def test_a_servovalve_needs_no_finer_steps_for_a_delayed_command(hold):
     """Its step draws the command as a straight line: that line has the mean and the change of what the command does."""

@@ -5,7 +5,8 @@ import numpy as np
 from jax import lax
 
 from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, off_by_error, relative_error, size, width
-from ehsvjax.holds import following
+from ehsvjax.holds import at_nodes, following
+from ehsvjax.holds import course as course_of
 
 # Share by which what has been calibrated is usually off at most.
 _CALIBRATED = 0.05
@@ -86,6 +87,13 @@ def _between_steps(own, course, context):
     del context
     step = own["share"] * (following(course[:, 0]) - course[:, 0])
     return course + jnp.stack([0.0 * step, 0.5 * step, step], axis=-1)
+
+
+def _smooth_between(own, course, context):
+    """Keep to a band: for share 1 the smooth curve that the samples fix."""
+    del context
+    smooth = at_nodes(course_of(course[:, :1], None, "band-limited"))[..., 0]
+    return course + own["share"] * (smooth - course)
 
 
 def _lagged(own, course, context):
@@ -178,6 +186,14 @@ INPUT = (
         _between_steps,
         says="the input runs otherwise between samples than it is said to: by half a sample for a share of one",
         settled_by="declare how the input runs between samples (hold), or measure it at ten times the rate",
+    ),
+    Effect(
+        "band_limited_input",
+        "input",
+        (amplitude("share", "", constant(1e-2), constant(-1.0), constant(2.0)),),
+        _smooth_between,
+        says="the input is a smooth curve between samples, as behind a filter, and not what it is said to be",
+        settled_by="declare the input's hold (band-limited), or measure it at ten times the rate",
     ),
     Effect(
         "input_lag",
