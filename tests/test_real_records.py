@@ -69,3 +69,15 @@ def test_a_constant_force_beside_slow_misfit_is_not_taken_for_its_drift():
     fit = ehsvjax.identify(rig.model, record, key=jax.random.key(0), population=40, generations=10)
     found = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
     assert {"coulomb_friction", "constant_force"} <= {*found.names}, str(found)
+
+
+@pytest.mark.thorough
+def test_dry_friction_of_a_stiff_drive_is_found_from_its_position_alone():
+    """Of the drive a hysteresis of the reference does nearly the same; the friction is known to be 20.4 N."""
+    rig = RIGS["drive"]()
+    (train,) = rig.records
+    record = train.slice(stop=10.0).select(outputs=["position"])
+    fit = ehsvjax.identify(rig.model, record, key=jax.random.key(0), population=40, generations=10)
+    found = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
+    assert found.names[0] == "coulomb_friction", str(found)
+    assert found.extended.parameters["coulomb_friction.force"] == pytest.approx(20.4, rel=0.05)

@@ -11,6 +11,7 @@ from scipy.signal import lsim
 import ehsvjax
 from benchmarks.real_models import damper
 from ehsvjax.diagnosis.bench.noise import plain_noise
+from ehsvjax.diagnosis.bench.parts import parts_at
 from ehsvjax.diagnosis.bench.refits import not_made_up_for, padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
@@ -18,11 +19,14 @@ from ehsvjax.diagnosis.decision.rivals import Rival, rivals_again
 from ehsvjax.diagnosis.decision.search import Stage, _from_nominal_starts_too, _look, _settled, _weighed
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_set, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
+from ehsvjax.diagnosis.hypotheses.process_noise import process_noise
 from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening
 from ehsvjax.effects import BANK
+from ehsvjax.effects.effect import PROBED
 from ehsvjax.population import cast, simulated
 from tests.compilations import compilations
 from tests.hidden_plants import servovalve_with
+from tests.small_models import carriage, carriage_plant, record_of
 
 # One process compiles; records are as long as those of test_diagnose.py.
 pytestmark = pytest.mark.xdist_group("diagnoses of the oscillator")
@@ -45,6 +49,20 @@ def bench_of(limit: float):
 @pytest.fixture(scope="module")
 def bench():
     return bench_of(np.inf)
+
+
+def test_a_probe_moves_an_output_by_a_little_where_a_force_moves_it_once_and_for_all():
+    # A carriage that follows its push at once: a force that is held shifts it, and moves it no more.
+    slow = 10.0 * np.sin(0.05 * np.arange(SAMPLES))
+    position = carriage_plant(slow, 0.5)[:, 0]
+    record = record_of(0.5, {"push": slow}, {"position": position}, {"position": 1e-4}, 5, hold="linear")
+    fit = ehsvjax.identify(carriage(), record, key=jax.random.key(0), population=20, generations=5)
+    bench = workbench(fit, [record], BANK)
+    added = np.zeros((2, *bench.disturbances.shape))
+    added[1, ..., bench.places.index("force")] = bench.probes["force"]
+    without, with_it = bench.simulated(np.repeat(bench.nominal[None], 2, axis=0), added)
+    assert np.std(with_it - without) < 0.5 * abs(np.mean(with_it - without))
+    assert np.sqrt(np.mean((with_it - without) ** 2)) == pytest.approx(PROBED * np.std(without), rel=0.01)
 
 
 def test_derivatives_are_those_of_jax_at_effects_present_and_absent(bench):
@@ -157,6 +175,37 @@ def test_unknowns_beside_a_curve_make_up_for_what_they_can(bench):
     free, beside = (refit(b, start, columns, noise, race=False) for b in (bench, acting))
     at_once = noise.scaled(acting.problem.samples.outputs - acting.simulated(start)[0])
     assert free.cost[0] <= beside.cost[0] < float(at_once @ at_once)
+
+
+def test_nothing_is_known_of_a_disturbance_that_lets_the_model_run_away(bench):
+    (stiffness,) = bench.columns_of(next(c for c in bench.candidates if c.name == "cubic_stiffness"))
+
+    def at(coefficient):
+        point = bench.nominal.copy()
+        point[stiffness] = coefficient
+        return point
+
+    def survived(coefficient):
+        return np.isfinite(parts := parts_at(bench, at(coefficient), "force").responses).all(axis=(1, 2, 3)) & (
+            np.abs(parts).max(axis=(1, 2, 3)) > 0.0
+        )
+
+    # A spring that softens until the record's own motion almost runs away from it: some pushes are survived.
+    hard, soft = 0.0, -1e6
+    for _ in range(60):
+        middle = 0.5 * (hard + soft)
+        share = survived(middle).mean()
+        if 0.0 < share < 1.0:
+            break
+        hard, soft = (middle, soft) if share == 1.0 else (hard, middle)
+    else:
+        pytest.fail("no spring that softens so much is found")
+    assert np.isfinite(bench.sketched(at(middle)[None])).all()
+    assert np.isfinite(parts_at(bench, at(middle), "force").responses).all()
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    there = refit(bench, at(middle)[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
+    found = process_noise(bench, there, noise)
+    assert found is None or np.isfinite(found.likelihood)
 
 
 def test_a_set_that_cannot_be_simulated_does_not_get_the_refit_of_another():

@@ -44,14 +44,17 @@ def workbench(fit: Fit, records: Sequence[Record], bank: Sequence[Effect]) -> Wo
 
 
 def _calibrated(bench: Workbench) -> dict[str, float]:
-    """Return for each place the disturbance that, held, moves some output by `PROBED` of its size."""
+    """Return for each place the disturbance that, held, moves some output by `PROBED` of its size.
+
+    What is moved at once and stays there is moved too: of a stiff drive a force moves nothing else.
+    """
     points = np.repeat(bench.nominal[None], 1 + len(bench.places), axis=0)
     added = np.zeros((len(points), *bench.disturbances.shape))
     for k, place in enumerate(bench.places):
         added[1 + k, ..., k] = bench.probes[place]
     outputs = bench.simulated(points, added)
     size = np.maximum(np.std(outputs[0], axis=(0, 1)), 1e-300)
-    moved = np.max(np.std(outputs[1:] - outputs[0], axis=(1, 2)) / size, axis=1)
+    moved = np.max(np.sqrt(np.mean((outputs[1:] - outputs[0]) ** 2, axis=(1, 2))) / size, axis=1)
     return {
         place: bench.probes[place] * (PROBED / by if np.isfinite(by) and by > ROUNDING else 1.0)
         for place, by in zip(bench.places, moved, strict=True)

@@ -244,6 +244,8 @@ class Workbench:
     ) -> Float[np.ndarray, "disturbance record time signal"]:
         """Return what each of so many disturbances changes in the outputs of a point, sketched.
 
+        Nothing is known of one that lets the model run away: near a hill of its potential any push may be too large.
+
         They are made as they are simulated: of a long record all at once would take more memory than what they do.
         """
         here = self.sketched(point[None])[0]
@@ -252,7 +254,8 @@ class Workbench:
         for first in range(0, count, AT_ONCE):
             rows = range(first, min(first + AT_ONCE, count))
             added = np.stack([disturbance(row) for row in rows])
-            changes[first : rows.stop] = self.sketched(np.repeat(point[None], len(rows), axis=0), added) - here
+            changed = self.sketched(np.repeat(point[None], len(rows), axis=0), added) - here
+            changes[first : rows.stop] = known_alone(changed)
         return changes
 
     def linearised(
@@ -325,6 +328,18 @@ def settled(
     if problem is bench.problem and rough.substeps == bench.sketched_at:
         return bench
     return replace(bench, problem=problem, sketched_at=rough.substeps)
+
+
+def known_alone(
+    changes: Float[np.ndarray, "change record time signal"],
+) -> Float[np.ndarray, "change record time signal"]:
+    """Return changes of the outputs, nothing in the place of those that run away: they tell of no direction.
+
+    Squares of what is kept are finite in single precision, in which sums of them are taken.
+    """
+    with np.errstate(over="ignore"):
+        known = np.isfinite(np.square(changes, dtype=np.float32)).all(axis=(1, 2, 3), keepdims=True)
+    return np.where(known, changes, 0.0)
 
 
 def with_readings(bench: Workbench, measured: Bool[np.ndarray, "record time signal"]) -> Workbench:

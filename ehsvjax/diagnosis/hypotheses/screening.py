@@ -18,7 +18,7 @@ from jaxtyping import Float
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT, corrected, smallest_p_values
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, unexplained
-from ehsvjax.diagnosis.bench.workbench import Workbench
+from ehsvjax.diagnosis.bench.workbench import Workbench, known_alone
 from ehsvjax.diagnosis.hypotheses.harmonics import Waves, with_frequencies
 from ehsvjax.effects.effect import UNLIMITED, Candidate
 
@@ -115,9 +115,7 @@ def responses_at(
     ]
     points = np.concatenate([np.zeros((0, len(point))), *(t.points for t in trials)])
     outputs = bench.sketched(np.concatenate([point[None], points]))
-    changes = outputs[1:] - outputs[0]
-    changes = np.where(np.isfinite(changes).all(axis=(1, 2, 3), keepdims=True), changes, 0.0)
-    return Responses(tuple(trials), changes)
+    return Responses(tuple(trials), known_alone(outputs[1:] - outputs[0]))
 
 
 def _trials(bench: Workbench, position: int, candidate: Candidate, point) -> list[Trial]:
