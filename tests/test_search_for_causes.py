@@ -30,7 +30,6 @@ def searched(monkeypatch, unchecked):
             return SimpleNamespace(stage=stage_of(tuple(included)), needless=needless, **rest)
 
         for name, stub in {
-            "prepared": lambda bench: bench,
             "trials_of": lambda bench, progress: SimpleNamespace(bench=bench),
             "plain_noise": lambda variance, measured: None,
             "refit_set": lambda trials, start, included, noise: included,

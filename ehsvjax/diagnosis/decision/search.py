@@ -26,7 +26,7 @@ from ehsvjax.diagnosis.decision.trials import (
     refit_sets,
     trials_of,
 )
-from ehsvjax.diagnosis.hypotheses.screening import Screening, responses_at, screen
+from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, responses_at, screen
 
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
@@ -348,14 +348,28 @@ def _known(
 
 
 def _next_effect(stage: Stage) -> Stage | None:
-    """Return the next look, with the effect more that explains most; none if none gains enough, or there are enough."""
+    """Return the next look, with the effect more that explains most; none if none gains enough, or there are enough.
+
+    What each of several records has for itself fits whatever each of them is: what all share, and explains alike, comes
+    before it.
+    """
     if len(stage.included) == _MOST_EFFECTS:
         return None
-    trials = stage.trials
-    bench = trials.bench
+    bench = stage.trials.bench
     hopeful = [
         s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
     ]
+    shared = _best_of(stage, [s for s in hopeful if not bench.of_each(s.candidate)])
+    own = _best_of(stage, [s for s in hopeful if bench.of_each(s.candidate)])
+    if shared is None or own is None:
+        return shared or own
+    return own if stage.noise.gained(shared.current.residual[0], own.current.residual[0]) > INSEPARABLE else shared
+
+
+def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
+    """Return the look with the one of some candidates that explains most; none if none gains enough."""
+    trials = stage.trials
+    bench = trials.bench
     best: Stage | None = None
     # The best by score are not always the best once refitted: if something is left of them, others are tried.
     for first in range(0, min(len(hopeful), 2 * REFITTED_TOGETHER), REFITTED_TOGETHER):
