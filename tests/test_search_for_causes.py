@@ -79,3 +79,24 @@ def test_a_search_that_goes_round_ends(searched):
     found, _ = searched({frozenset(): "a0", **{frozenset({f"a{k}"}): "b" for k in range(1, 50)}}, swaps | {
         frozenset({f"a{k}", "b"}): ((f"a{k + 1}", "b"), "b") for k in range(1, 50)})  # fmt: skip
     assert len(found) == 1
+
+
+@pytest.mark.parametrize(("gained", "chosen"), [(5.0, "dead zone"), (-50.0, "dead zone"), (50.0, "change of gain")])
+def test_what_all_records_share_comes_before_what_each_has_for_itself(monkeypatch, unchecked, gained, chosen):
+    """Unless that explains more than chance would have it: it fits whatever each record is."""
+    names = ("change of gain", "dead zone")
+    bench = SimpleNamespace(of_each=lambda candidate: candidate == 0)
+
+    def best_of(stage, hopeful):
+        (one,) = hopeful
+        return SimpleNamespace(name=names[one.candidate], current=SimpleNamespace(residual=[one.candidate]))
+
+    monkeypatch.setattr(search, "_best_of", best_of)
+    monkeypatch.setattr(search, "fits", lambda bench, included: True)
+    stage = SimpleNamespace(
+        trials=SimpleNamespace(bench=bench),
+        included=(),
+        screening=SimpleNamespace(ranked=[SimpleNamespace(candidate=k, corrected=0.0) for k in (0, 1)]),
+        noise=SimpleNamespace(gained=lambda before, after: gained if (before, after) == (1, 0) else -gained),
+    )
+    assert search._next_effect(stage).name == chosen
