@@ -154,6 +154,9 @@ def follow_with_play(own, value, context, memory):
     return level, (level,)
 
 
+# To another course between the samples, one for all of it.
+_SHARE_OF_THE_WAY = amplitude("share", "", constant(1e-2), constant(-1.0), constant(2.0))
+
 INPUT = (
     Effect(
         "input_gain",
@@ -182,7 +185,7 @@ INPUT = (
     Effect(
         "input_hold",
         "input",
-        (amplitude("share", "", constant(1e-2), constant(-1.0), constant(2.0)),),
+        (_SHARE_OF_THE_WAY,),
         _between_steps,
         says="the input runs otherwise between samples than it is said to: by half a sample for a share of one",
         settled_by="declare how the input runs between samples (hold), or measure it at ten times the rate",
@@ -190,7 +193,7 @@ INPUT = (
     Effect(
         "band_limited_input",
         "input",
-        (amplitude("share", "", constant(1e-2), constant(-1.0), constant(2.0)),),
+        (_SHARE_OF_THE_WAY,),
         _smooth_between,
         says="the input is a smooth curve between samples, as behind a filter, and not what it is said to be",
         settled_by="declare the input's hold (band-limited), or measure it at ten times the rate",
