@@ -139,6 +139,11 @@ def _check_output(label: str, values: np.ndarray) -> None:
     if present.size == 0:
         raise ValueError(f"{label} is empty, all {len(values)} samples are NaN: leave it out or check its column")
     measured = values[present]
+    if present.size == 1:
+        raise ValueError(
+            f"{label} has a single measured sample of {len(values)}, {measured[0]:.9g} at sample {present[0]}: leave "
+            "it out, or take a longer part of the record, or one with fewer gaps"
+        )
     if measured.min() == measured.max():
         raise ValueError(
             f"{label} never changes, it is {measured[0]:.9g} from sample {present[0]} to {present[-1]}: "

@@ -7,7 +7,7 @@ from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import interp1d
 
@@ -83,6 +83,8 @@ REFUSED = [
     (position(*[NAN] * 5), "output 'position' is empty, all 5 samples are NaN", "leave it out"),
     (position(NAN, 0.25, 0.25, NAN, 0.25), "output 'position' never changes, it is 0.25 from sample 1 to 4",
         "leave it out, or take a longer part"),
+    (position(NAN, 0.25, NAN, NAN, NAN), "output 'position' has a single measured sample of 5, 0.25 at sample 1",
+        "or one with fewer gaps"),
     (position("0", "1", "n/a", "2", "3"), "output 'position' holds 'n/a' at sample 2", "expected real"),
     (position(*np.ones((5, 2))), "output 'position' has shape (5, 2): expected 1-D", "pass one column"),
     ({"outputs": {"position": np.ma.masked_equal(POSITION, 0.3)}}, "output 'position' is a masked array",
@@ -396,6 +398,7 @@ def test_rounded_stamps_neither_delay_nor_lose_a_held_input(late):
 
 
 @PROPERTY
+@example(4, 36179, 1.0)  # a gap leaves the first reading alone
 @given(st.integers(3, 60), SEED, st.floats(0.05, 1.0))
 def test_resampling_non_uniform_time_agrees_with_scipy(count, seed, period):
     random = np.random.default_rng(seed)
@@ -403,14 +406,21 @@ def test_resampling_non_uniform_time_agrees_with_scipy(count, seed, period):
     command, position = random.standard_normal((2, count))
     period = min(period, (time[-1] - time[0]) * 0.99)
     record = Record(time, {"command": command}, {"position": position}, uniform=False)
-    even = record.resample(period, inputs_known_in_gaps=True)
-    assert even.time[0] == time[0]
-    assert even.time[-1] <= time[-1] + 0.021 * period and even.time[-1] + period > time[-1]
-    grid = np.minimum(even.time, time[-1])
+    # A hair behind the end counts as at it.
+    stamps = time[0] + period * np.arange(int((time[-1] - time[0]) / period + 0.02) + 1)
+    grid = np.minimum(stamps, time[-1])
     steps = np.diff(time)
     in_gap = np.zeros(len(grid), dtype=bool)
     for row in np.flatnonzero(steps > 2.5 * np.median(steps)):
         in_gap |= (grid > time[row] + 1e-6) & (grid < time[row + 1] - 1e-6)
+    if (~in_gap).sum() == 1:
+        with pytest.raises(ValueError, match=f"single measured sample of {len(grid)}, .* at sample 0: .* fewer gaps"):
+            record.resample(period, inputs_known_in_gaps=True)
+        return
+    even = record.resample(period, inputs_known_in_gaps=True)
+    assert even.time[0] == time[0]
+    assert even.time[-1] <= time[-1] + 0.021 * period and even.time[-1] + period > time[-1]
+    np.testing.assert_allclose(even.time, stamps, rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(
         even.outputs["position"], np.where(in_gap, NAN, interp1d(time, position)(grid)), atol=1e-5
     )
