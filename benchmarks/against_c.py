@@ -20,6 +20,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from ehsvjax import kernels
 from ehsvjax.population import population_cost, shared_cost, to_values
 
 matplotlib.use("Agg")
@@ -69,12 +70,12 @@ def by_c(library: ctypes.CDLL, name: str, case: common.Case, individuals: jax.Ar
 def by_jax(case: common.Case, individuals: jax.Array, cores: int) -> dict:
     """Return what costs the individuals here: on several cores as it is, and with every core given all costs."""
     if cores == 1:
-        return {"ehsvjax": functools.partial(jax.jit(population_cost), case.problem, individuals)}
+        return {"ehsvjax": functools.partial(kernels.jit(population_cost), case.problem, individuals)}
     devices = tuple(jax.devices()[:cores])
     placed = common.on_all((case.problem, individuals))
     return {
-        "ehsvjax": functools.partial(jax.jit(shared_cost(devices, gathered=False)), *placed),
-        "gathered": functools.partial(jax.jit(shared_cost(devices)), *placed),
+        "ehsvjax": functools.partial(kernels.jit(shared_cost(devices, gathered=False)), *placed),
+        "gathered": functools.partial(kernels.jit(shared_cost(devices)), *placed),
     }
 
 

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common, monte_carlo
+from ehsvjax import kernels
 from ehsvjax.population import cast, population_cost, simulated, to_unit, to_values
 from ehsvjax.unknowns import problem_of
 
@@ -65,8 +66,12 @@ def ours(problem) -> Iterator[Contender]:
         yield Contender(
             f"{count} a sample",
             lambda individual, finer=finer: simulated(finer, individual)[0, :, 0],
-            functools.partial(population_cost, finer),
+            functools.partial(_cost, finer),
         )
+
+
+# As a search compiles it.
+_cost = kernels.jit(population_cost)
 
 
 def theirs(problem, record, field: Callable, solver, adaptive: bool) -> Iterator[Contender]:
@@ -98,6 +103,7 @@ def theirs(problem, record, field: Callable, solver, adaptive: bool) -> Iterator
             )  # fmt: skip
             return solution.ys[:, 0]
 
+        @jax.jit
         def cost(individuals, trajectory=trajectory):
             return jax.vmap(lambda x: jnp.sum((measured - trajectory(x)) ** 2) / problem.noise_variance[0])(individuals)
 
@@ -191,7 +197,7 @@ def measured(name: str, repeats: int) -> list[dict]:
                 rows.append(row | {"steps": one.steps if one else "never so close"})
                 print(f"{name}, {row['precision']}, {label}: {rows[-1]['steps']}, {error:.2g}", flush=True)
                 if one is not None:
-                    found[label] = functools.partial(jax.jit(one.cost), some)
+                    found[label] = functools.partial(one.cost, some)
             taken = common.medians(found, repeats)
             for row in rows:
                 if row["precision"] == np.dtype(precision).name and row["contender"] in taken:
