@@ -64,9 +64,9 @@ _WORTH_STORING = 8
 _BLOCK = 256
 # Samples that one kernel stores.
 _STORED_TOGETHER = 32
-# Blocks are filled up to two whole vector registers, each of 16 single-precision numbers at most. What is narrower is
-# compiled differently, and rounds differently in the last bit.
-VECTOR = 32
+# Blocks are filled up to whole vector registers, of 16 single-precision numbers at most, two at least. What is narrower
+# is compiled differently, and rounds differently in the last bit.
+VECTOR = 16
 
 # Memory mappings of this process, of the 65,530 that Linux grants: without one more, XLA fails to load a program, and
 # dies of it where the program is to be cached. Programs of one length of record hold some hundred.
@@ -184,7 +184,7 @@ def in_blocks(function: Callable, rows: Float[Array, "individual parameter"]) ->
     if not _shaped() or count == 1:
         return one_kernel(function)(rows)
     blocks = -(-count // _BLOCK)
-    width = -(-count // (blocks * VECTOR)) * VECTOR
+    width = max(2, -(-count // (blocks * VECTOR))) * VECTOR
     rows = filled_up(rows, blocks * width)
     if blocks == 1:
         return one_kernel(function)(rows)[:count]
