@@ -31,9 +31,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common, monte_carlo
+from benchmarks.peers import van_der_pol_motion
 from ehsvjax import kernels
 from ehsvjax.population import cast, population_cost, simulated, to_unit, to_values
 from ehsvjax.unknowns import problem_of
+from tests.plants import Valve
 
 CLOSE = 1e-6
 MOST_STEPS = 256
@@ -42,6 +44,8 @@ BEFORE = 1e-6
 # Opening, m, that the plant's implicit orifice equation takes for a closed valve.
 FLOOR = 1e-8
 TOLERANCES = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
+# Of the implicit stages where no tolerance of the steps tells one.
+ROOTS = 1e-7
 
 
 class Contender(NamedTuple):
@@ -60,25 +64,22 @@ class Contender(NamedTuple):
 
 
 def ours(problem) -> Iterator[Contender]:
-    """Yield this package, with more and more steps."""
+    """Yield this package, with more and more steps, compiled as a search is."""
+    cost = kernels.jit(population_cost)
     for count in _counts():
         finer = replace(problem, substeps=jnp.int32(count))
         yield Contender(
             f"{count} a sample",
             lambda individual, finer=finer: simulated(finer, individual)[0, :, 0],
-            functools.partial(_cost, finer),
+            functools.partial(cost, finer),
         )
-
-
-# As a search compiles it.
-_cost = kernels.jit(population_cost)
 
 
 def theirs(problem, record, field: Callable, solver, adaptive: bool) -> Iterator[Contender]:
     """Yield one of diffrax's solvers, with more and more steps."""
     period = record.sample_period
     dtype = problem.noise_variance.dtype
-    times, measured = jnp.asarray(record.time, dtype), jnp.asarray(record.outputs["position"], dtype)
+    times, readings = jnp.asarray(record.time, dtype), jnp.asarray(record.outputs["position"], dtype)
     command = record.inputs["command"]
     at = np.flatnonzero(np.diff(command, prepend=command[0]) != 0)
     jumps, levels = jnp.asarray(record.time[at], dtype), jnp.asarray(command[np.append(0, at)], dtype)
@@ -105,7 +106,7 @@ def theirs(problem, record, field: Callable, solver, adaptive: bool) -> Iterator
 
         @jax.jit
         def cost(individuals, trajectory=trajectory):
-            return jax.vmap(lambda x: jnp.sum((measured - trajectory(x)) ** 2) / problem.noise_variance[0])(individuals)
+            return jax.vmap(lambda x: jnp.sum((readings - trajectory(x)) ** 2) / problem.noise_variance[0])(individuals)
 
         yield Contender(f"tolerance {size:g}" if adaptive else f"{size} a sample", trajectory, cost)
 
@@ -119,18 +120,13 @@ def _counts() -> Iterator[int]:
 
 def van_der_pol(values, command):
     """Return the start of the Van der Pol oscillator, and its equation (10)."""
-
-    def motion(t, y, args):
-        del args
-        return jnp.stack([values[0] * y[1], -y[0] + values[1] * (1.0 - y[0] ** 2) * y[1] + command(t)])
-
-    return values[2:], motion
+    return values[2:], van_der_pol_motion(values, command)
 
 
 def servovalve(values, command):
     """Return the start of the servovalve, and its equations as the paper writes them: implicit in the load pressure."""
     dead_zone, saturation, flow_gain, feedback_gain, damping_ratio, frequency, x, p, r = values
-    area, supply, mass, stiffness = 25e-4, 140e5, 20.0, 1e4
+    area, supply, mass, stiffness = Valve().piston_area, Valve().supply_pressure, Valve().mass, Valve().stiffness
 
     def motion(t, y, args):
         del args
@@ -154,8 +150,6 @@ SOLVERS: dict[str, tuple[Any, ...]] = {
     "van_der_pol": (diffrax.Heun, diffrax.Tsit5, diffrax.Kvaerno3),
     "servovalve": (diffrax.Kvaerno3,),
 }
-# Of the implicit stages where no tolerance of the steps tells one.
-ROOTS = 1e-7
 
 
 def accurate(contenders: Iterator[Contender], truth: jax.Array, plant: np.ndarray) -> tuple[Contender | None, float]:
@@ -174,36 +168,39 @@ def accurate(contenders: Iterator[Contender], truth: jax.Array, plant: np.ndarra
 
 def measured(name: str, repeats: int) -> list[dict]:
     """Return a row for each contender of one model."""
-    experiment = getattr(monte_carlo, name)()
-    record, plant, rows = experiment.record, experiment.record.outputs["position"], []
-    for precision in (jnp.float32, jnp.float64):
-        with jax.enable_x64(precision == jnp.float64):
-            problem = cast(problem_of(experiment.model, [record]), precision)
-            nominal = [experiment.truth.get(n, 0.0) for n in (n.partition("[")[0] for n in problem.names)]
-            truth = jnp.asarray(to_unit(problem.coordinates, np.asarray(nominal)), precision)
-            some = 0.25 + 0.5 * jax.random.uniform(jax.random.key(0), (experiment.population, len(truth)), precision)
-            # Where each starts is what it does: all from rest, as the record.
-            some = some.at[:, len(experiment.truth) :].set(truth[len(experiment.truth) :])
-            found: dict[str, Callable] = {}
-            solvers = SOLVERS[name] if precision == jnp.float64 else ()
-            contenders = {"ehsvjax": ours(problem)} | {
-                f"diffrax {solver.__name__}, {'adaptive' if adaptive else 'constant'} steps":
-                theirs(problem, record, FIELDS[name], solver, adaptive)
-                for solver in solvers for adaptive in (False, True)
-            }  # fmt: skip
-            for label, finer_and_finer in contenders.items():
-                one, error = accurate(finer_and_finer, truth, plant)
-                row = {"model": name, "precision": np.dtype(precision).name, "contender": label, "error": error}
-                rows.append(row | {"steps": one.steps if one else "never so close"})
-                print(f"{name}, {row['precision']}, {label}: {rows[-1]['steps']}, {error:.2g}", flush=True)
-                if one is not None:
-                    found[label] = functools.partial(one.cost, some)
-            taken = common.medians(found, repeats)
-            for row in rows:
-                if row["precision"] == np.dtype(precision).name and row["contender"] in taken:
-                    row["ms/generation"] = 1e3 * taken[row["contender"]]
+    rows = [row for precision in (jnp.float32, jnp.float64) for row in measured_in(precision, name, repeats)]
     own = min(row["ms/generation"] for row in rows if row["contender"] == "ehsvjax" and "ms/generation" in row)
     return [row | {"times ours": row["ms/generation"] / own if "ms/generation" in row else None} for row in rows]
+
+
+def measured_in(precision, name: str, repeats: int) -> list[dict]:
+    """Return a row for each contender of one model that computes in this precision."""
+    experiment = getattr(monte_carlo, name)()
+    record, given = experiment.record, len(experiment.truth)
+    with jax.enable_x64(precision == jnp.float64):
+        problem = cast(problem_of(experiment.model, [record]), precision)
+        nominal = [experiment.truth.get(unknown, 0.0) for unknown in problem.names]
+        truth = jnp.asarray(to_unit(problem.coordinates, np.asarray(nominal)), precision)
+        some = 0.25 + 0.5 * jax.random.uniform(jax.random.key(0), (experiment.population, len(truth)), precision)
+        # All start from rest, as the record.
+        some = some.at[:, given:].set(truth[given:])
+        contenders = {"ehsvjax": ours(problem)} | {
+            f"diffrax {solver.__name__}, {'adaptive' if adaptive else 'constant'} steps":
+            theirs(problem, record, FIELDS[name], solver, adaptive)
+            for solver in (SOLVERS[name] if precision == jnp.float64 else ()) for adaptive in (False, True)
+        }  # fmt: skip
+        rows: dict[str, dict] = {}
+        timed: dict[str, Callable] = {}
+        for label, finer_and_finer in contenders.items():
+            one, error = accurate(finer_and_finer, truth, record.outputs["position"])
+            rows[label] = {"model": name, "precision": np.dtype(precision).name, "contender": label, "error": error,
+                           "steps": one.steps if one else "never so close"}  # fmt: skip
+            print(f"{name}, {rows[label]['precision']}, {label}: {rows[label]['steps']}, {error:.2g}", flush=True)
+            if one is not None:
+                timed[label] = functools.partial(one.cost, some)
+        for label, taken in common.medians(timed, repeats).items():
+            rows[label]["ms/generation"] = 1e3 * taken
+    return list(rows.values())
 
 
 def main() -> None:

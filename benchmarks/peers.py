@@ -96,6 +96,16 @@ def evosax_ga(cost: Callable[[jax.Array], jax.Array], unknowns: int, population:
     return step, lambda: held[2]
 
 
+def van_der_pol_motion(values, command: Callable) -> Callable:
+    """Return equation (10) of the paper as diffrax takes it, for `[alpha, gamma, ...]` and a command of the time."""
+
+    def motion(t, y, args):
+        del args
+        return jnp.stack([values[0] * y[1], -y[0] + values[1] * (1.0 - y[0] ** 2) * y[1] + command(t)])
+
+    return motion
+
+
 def diffrax_cost(case, solver: str) -> Callable[[jax.Array], jax.Array]:
     """Return the Van der Pol cost of a population by diffrax, by a solver at the same step, vmapped; to be traced."""
     import diffrax
@@ -105,15 +115,14 @@ def diffrax_cost(case, solver: str) -> Callable[[jax.Array], jax.Array]:
     times, command = jnp.asarray(record.time, jnp.float32), jnp.asarray(record.inputs["command"], jnp.float32)
     measured = jnp.asarray(record.outputs["position"], jnp.float32)
 
-    def field(t, y, values):
-        u = command[jnp.minimum((t / period + 1e-3).astype(jnp.int32), len(command) - 1)]
-        return jnp.stack([values[0] * y[1], -y[0] + values[1] * (1.0 - y[0] ** 2) * y[1] + u])
+    def held(t):
+        return command[jnp.minimum((t / period + 1e-3).astype(jnp.int32), len(command) - 1)]
 
     def one(individual):
         values = to_values(problem.coordinates, individual)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), getattr(diffrax, solver)(), times[0], times[-1],
-            period / problem.grid.substeps, values[2:], args=values,
+            diffrax.ODETerm(van_der_pol_motion(values, held)), getattr(diffrax, solver)(), times[0], times[-1],
+            period / problem.grid.substeps, values[2:],
             saveat=diffrax.SaveAt(ts=times), stepsize_controller=diffrax.ConstantStepSize(),
             max_steps=len(record) * problem.grid.substeps + 16,
         )  # fmt: skip

@@ -46,8 +46,8 @@ if _PLAIN:
         f"{_PLAIN}: time loops run as XLA compiles them by itself, right but several times slower", stacklevel=1
     )
 
-# With the first version of JAX whose XLA does not know it, or was not asked: it refuses what it does not know. LLVM
-# takes half of the widest registers of a CPU with AVX-512 unless told otherwise; other CPUs have no wider ones.
+# Each with the version of JAX from which on it is not asked for: XLA refuses an option that it does not know. Unless
+# told otherwise LLVM takes half of the widest registers of a CPU with AVX-512; other CPUs have no wider ones.
 _OPTIONS = {
     option: value
     for option, value, until in (
