@@ -6,6 +6,7 @@ import pytest
 
 import ehsvjax
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
+from tests.hidden_records import Hidden, records
 from tests.small_models import ball, shaken_ball
 
 pytestmark = pytest.mark.xdist_group("diagnoses of a ball")
@@ -51,3 +52,12 @@ def test_a_cause_is_named_beside_a_random_force():
     (size,) = spring.sizes
     assert abs(size.value - 0.5) < 4.0 * size.standard_error < 0.1
     assert chance.sizes[0].value == pytest.approx(1e-5, rel=0.4)
+
+
+def test_a_weak_force_on_an_oscillator_is_no_periodic_one():
+    """An oscillator's unknowns take up most of what shakes it: what is left was named a periodic stiffness."""
+    (made,) = records([Hidden("van_der_pol", "white", 0.05, ("process_noise",), 1626778172)])
+    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
+    fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=jax.random.key(0), population=100, generations=50)
+    diagnosis = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
+    assert PROCESS_NOISE in names_in(diagnosis), diagnosis

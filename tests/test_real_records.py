@@ -5,6 +5,7 @@ import pytest
 
 import ehsvjax
 from benchmarks.real_records import AT_HAND, RIGS, judged
+from ehsvjax.diagnosis.decision.verdict import UNKNOWN
 
 pytestmark = pytest.mark.skipif(not AT_HAND, reason="the measured records are not at hand")
 
@@ -58,6 +59,9 @@ def test_what_was_of_one_sweep_is_not_predicted_of_the_other():
     found = ehsvjax.diagnose(fit, one, key=jax.random.key(1))
     assert {"input_hysteresis", "sensor_lag"} <= {*found.names, *(c for a in found.alternatives for c in a.causes)}
     assert found.extended.score(other).rmse["flow"] < fit.score(other).rmse["flow"], str(found)
+    # A drift of the flow gain, without which the end of the sweep is predicted as well, beside a rest along time.
+    for drift in (cause.name for cause in found.causes if cause.of_run):
+        assert any({drift, UNKNOWN} <= {*a.causes} for a in found.alternatives), str(found)
 
 
 @pytest.mark.thorough

@@ -52,16 +52,15 @@ def test_what_leaves_something_and_predicts_nothing_may_stand_for_what_the_bank_
     given = []
     monkeypatch.setattr(recipe, "verdict_of", lambda *all_of_it: given.append(all_of_it) or verdict_of(*all_of_it))
     found = diagnosed([shaken(3.0, 1)])
-    ((examined, predicts),) = given
-    assert predicts and found.gain.predicts and found.innocent, str(found)
-    assert not found.gain._replace(left_open=(True,)).predicts
+    ((examined, predicted_by),) = given
+    assert predicted_by == found.gain.predicted_by == (True,) and found.innocent, str(found)
     left = examined._replace(innocent=False)
-    sure, unsure = (verdict_of(left, told) for told in (True, False))
+    sure, unsure = (verdict_of(left, told) for told in ((True,), (False,)))
     for group, open_group in zip(sure.groups, unsure.groups, strict=True):
         assert UNKNOWN not in group
         assert open_group == {name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5}
     assert unsure.word == "ambiguous" and "another record" in unsure.alternatives[0].settled_by
-    assert verdict_of(examined, False) == verdict_of(examined, True)
+    assert verdict_of(examined, (False,)) == verdict_of(examined, (True,))
     # What the bank lacks is no model that an experiment could be planned to tell from the cause.
     alone = unsure._replace(groups=({found.names[0]: 0.5, UNKNOWN: 0.5},))
     assert explanations_of(examined.selection, alone) == ()

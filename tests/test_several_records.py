@@ -200,6 +200,8 @@ def test_what_each_record_alone_leaves_open_is_no_evidence_against_a_cause():
     suspected = {*found.names, *(name for a in found.alternatives for name in a.causes)}
     assert "coulomb_friction" in suspected and found.innocent, str(found)
     assert any(found.gain.left_open) and "(fitted with all, as the other records leave open" in str(found)
+    # What is fitted is not predicted.
+    assert not (all(found.gain.left_open) and any(found.gain.predicted_by)), str(found)
     assert "on data that were not used" not in str(found).splitlines()[0]
     for outputs in found.gain.by_record:
         assert outputs["position"].rmse_after < 0.9 * outputs["position"].rmse_before, str(found)

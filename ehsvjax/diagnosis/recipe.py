@@ -132,7 +132,7 @@ def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...],
     if selection.included:
         wider = as_fit(selection, selection.final, selection.included)
     gain = gain_of(selection, nominal, wider, validation, rng)
-    return wider, gain, verdict_of(examined, gain.predicts)
+    return wider, gain, verdict_of(examined, gain.predicted_by)
 
 
 def _check(fit, records, validation, key, progress) -> None:

@@ -18,8 +18,6 @@ SIGNIFICANT = 0.002
 """Corrected p-value of a whole search below which something is taken to be there."""
 PER_NUMBER = 4.0
 """Noise variances that each number of an effect must bring, so that more numbers are no advantage."""
-CONVINCING = 20.0
-"""Twice the log-likelihood by which a random force must be better than the noise of a sensor."""
 _DRAWS = 20_000
 # Draws below which a share of all draws says little.
 _FEW = 20

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ehsvjax.diagnosis.bench.evidence import CONVINCING, INSEPARABLE, SIGNIFICANT
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, SIGNIFICANT
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left
 from ehsvjax.diagnosis.decision.prediction import predicted
@@ -33,6 +33,8 @@ class Examination(NamedTuple):
         chance: the random force that explains what the causes leave; None if none does.
         chance_behind: noise variances by which a random force alone is behind all causes together, less what chance
             would gain with these; infinite where none is about as likely.
+        behind_chance: causes that the random force stands for, name -> by how much they are less likely, where they
+            are about as likely.
         instead: one term of free form that explains the record as well as all causes together, but for the price of
             its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -46,6 +48,7 @@ class Examination(NamedTuple):
     undecided: bool
     chance: ProcessNoise | None
     chance_behind: float
+    behind_chance: dict[str, float]
     instead: MissingTerm | None
     lacking: bool
 
@@ -73,8 +76,10 @@ def examine(selection: Selection) -> Examination:
         instead_of = _chance_instead(selection, force)
         least = min(instead_of, key=lambda causes: instead_of[causes], default=())
         if least and instead_of[least] < 0.0:
-            return examine(without(selection, least))
-        chance = _chance_in(selection, selection.final, force, after)
+            return _with_rivals_of_chance(examine(without(selection, least)), least, -instead_of[least])
+        # What no test sees must be there by the likelihood alone.
+        needed = 0.0 if _significant(after) else -2.0 * float(np.log(SIGNIFICANT))
+        chance = _chance_in(selection, selection.final, force, after, needed)
         chance_behind = instead_of.get(selection.included, np.inf)
     if chance is not None:
         innocent = True
@@ -85,7 +90,14 @@ def examine(selection: Selection) -> Examination:
     if lacking and chance is not None:
         innocent = False
     still_open = undecided and repeated is None
-    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, instead, lacking)
+    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, {}, instead, lacking)
+
+
+def _with_rivals_of_chance(examined: Examination, causes: tuple[int, ...], behind: float) -> Examination:
+    if examined.chance is None or examined.chance.settled or not behind < INSEPARABLE:
+        return examined
+    rivals = {examined.selection.bench.candidates[cause].name: behind for cause in causes}
+    return examined._replace(behind_chance=examined.behind_chance | rivals)
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
@@ -133,24 +145,33 @@ def _chance_instead(selection: Selection, beside: ProcessNoise) -> dict[tuple[in
         behind = beside.best - force.likelihood - sum(required[cause] for cause in causes)
         if behind < INSEPARABLE:
             terms = terms_at(bench, refitted.points[0], selection.trials.terms.curves)
-            if _chance_in(selection, refitted, force, dependences(refitted, noise, terms)) is not None:
+            # Something is there: the causes were seen.
+            if _chance_in(selection, refitted, force, dependences(refitted, noise, terms), 0.0) is not None:
                 found[causes] = behind
     return found
 
 
 def _chance_in(
-    selection: Selection, refitted: Refits, force: ProcessNoise, tests: tuple[Dependence, ...]
+    selection: Selection, refitted: Refits, force: ProcessNoise, tests: tuple[Dependence, ...], needed: float
 ) -> ProcessNoise | None:
     """Return a random force that shows in what a refit leaves, if that is chance.
 
-    What repeats itself is none, and a term that depends on what runs along the model is a better reason.
+    What repeats itself is none, and a term of free form that is plainly more likely is a better reason.
+
+    Args:
+        selection: of the refit.
+        refitted: without the random force.
+        force: what is left as one.
+        tests: of what is left.
+        needed: by how much it must be more likely than noise of the sensor.
+
     """
     repeated = repeats_itself(selection.bench, refitted.residual[0], selection.noise)
-    if repeated or not force.likelihood - force.of_sensor > CONVINCING:
+    if repeated or not force.likelihood - force.of_sensor > needed:
         return None
     if _significant(tests):
         term, _ = missing_term(selection.bench, refitted, selection.noise, selection.seen, _suspects(tests))
-        if _likelihood(selection.noise, term) > force.likelihood:
+        if _likelihood(selection.noise, term) > force.likelihood + INSEPARABLE:
             return None
     return force._replace(settled=repeated is False)
 

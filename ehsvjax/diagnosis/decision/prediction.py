@@ -42,11 +42,11 @@ class Predicted(NamedTuple):
         lost = float(np.sum((self.squares[k] - self.squares[j])[parts]))
         return self.noise.as_gain(lost, self.refitted[k], self.refitted[j])
 
-    def left_open(self, record: int) -> bool:
-        """Whether a record is predicted worse by the first set than by the last, and yet speaks for it."""
-        worse = self.noise.of_record(record).gained(self.residual[0], self.residual[-1])
+    def left_open(self, record: int, k: int) -> bool:
+        """Whether a record is predicted worse by the first set than by another, and yet speaks for it."""
+        worse = self.noise.of_record(record).gained(self.residual[0], self.residual[k])
         part = min(record, self.squares.shape[1] - 1)
-        return worse > INSEPARABLE and self.against(0, -1, slice(part, part + 1)) < -INSEPARABLE
+        return worse > INSEPARABLE and self.against(0, k, slice(part, part + 1)) < -INSEPARABLE
 
     def of(self, some: Sequence[int]) -> "Predicted":
         """Return it for some of the sets."""

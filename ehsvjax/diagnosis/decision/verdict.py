@@ -1,5 +1,6 @@
 """The verdict: adequate, named, ambiguous or unexplained, with the causes and what could be there instead."""
 
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +9,6 @@ from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, probabilities
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.examination import Examination
 from ehsvjax.diagnosis.decision.search import Need, Selection
-from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.readings import lattice
 
 QUANTISATION = "sensor_quantisation"
@@ -48,24 +48,24 @@ class Verdict(NamedTuple):
     alternatives: tuple[Alternative, ...]
 
 
-def verdict_of(examined: Examination, predicts: bool) -> Verdict:
+def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     """Return the verdict, with the causes and what could be there instead.
 
     Args:
         examined: the causes, and what they leave.
-        predicts: whether they predict data that were not used.
+        predicted_by: of each cause, whether it helps to predict data that were not used.
 
     """
     selection, bench = examined.selection, examined.selection.bench
     order = np.argsort([-need.gain for need in selection.needs]).tolist()
     groups = [_group(examined, k) for k in order]
-    if not (examined.innocent or predicts):
-        # What leaves something, and predicts nothing, may as well stand for what the bank lacks.
-        groups = [{name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5} for group in groups]
+    if not examined.innocent:
+        # Where something is left, what predicts nothing may as well stand for what the bank lacks.
+        groups = [g if predicted_by[k] else _or_unknown(g) for k, g in zip(order, groups, strict=True)]
     if examined.lacking or not (examined.innocent or groups):
         return Verdict("unexplained", (), (), ())
     others = [{name: 1.0} for name in _quantised(selection)]
-    others += [_chance(examined.chance)] if examined.chance else []
+    others += [_chance(examined)] if examined.chance else []
     included = (*(selection.included[k] for k in order), *(None for _ in others))
     every = (*groups, *others)
     if not every:
@@ -74,6 +74,10 @@ def verdict_of(examined: Examination, predicts: bool) -> Verdict:
         Alternative(tuple(g), _settled_by(bench, tuple(g)), tuple(g.values())) for g in every if len(g) > 1
     )
     return Verdict("ambiguous" if alternatives else "named", every, included, alternatives)
+
+
+def _or_unknown(group: Mapping[str, float]) -> dict[str, float]:
+    return {name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5}
 
 
 def _group(examined: Examination, k: int) -> dict[str, float]:
@@ -100,11 +104,14 @@ def _nothing_behind(need: Need) -> float:
     return need.gain - need.required
 
 
-def _chance(chance: ProcessNoise) -> dict[str, float]:
-    """Return what may be there of chance: unless the experiment was repeated, nothing speaks for it against a term that
-    the bank lacks.
+def _chance(examined: Examination) -> dict[str, float]:
+    """Return what may be there of chance, and what is about as likely.
+
+    Unless the experiment was repeated, nothing speaks for chance against a term that the bank lacks.
     """
-    return {PROCESS_NOISE: 1.0} if chance.settled else {PROCESS_NOISE: 0.5, UNKNOWN: 0.5}
+    behind = {PROCESS_NOISE: 0.0, **examined.behind_chance}
+    found = dict(zip(behind, probabilities([*behind.values()]).tolist(), strict=True))
+    return found if examined.chance is not None and examined.chance.settled else _or_unknown(found)
 
 
 def _quantised(selection: Selection) -> tuple[str, ...]:

@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.parts import parts_at
-from ehsvjax.diagnosis.bench.refits import Refits, refit
-from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench
+from ehsvjax.diagnosis.bench.refits import Refits, refit, span
+from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.precision.residual_noise import residual_noise
 
 # Rounds in which a random force and the unknowns under it settle, and what the last one gains at most.
@@ -28,7 +28,8 @@ class ProcessNoise(NamedTuple):
     Attributes:
         place: signal at which it acts.
         intensity: its spectral density.
-        likelihood: twice the logarithm with the random force and white noise of the sensor.
+        likelihood: twice the logarithm with the random force and white noise of the sensor, less Bayes' price for its
+            intensity.
         of_sensor: the same with the best noise of the sensor alone, white or correlated.
         settled: whether a repeat of the experiment left something else: without one, nothing tells chance from a term
             that the bank lacks.
@@ -77,8 +78,8 @@ def process_noise(
         _likelihood_of_sensor(np.where(there, one, 0.0)[None], there[None])
         for one, there in zip(residual, measured, strict=True)
     )
-    units = noise.log_units
-    return ProcessNoise(places[0], force.intensity, 2.0 * force.likelihood - units, 2.0 * float(sensor) - units)
+    units, price = noise.log_units, float(np.log(measured.sum()))
+    return ProcessNoise(places[0], force.intensity, 2.0 * force.likelihood - price - units, 2.0 * float(sensor) - units)
 
 
 class _Force(NamedTuple):
@@ -134,21 +135,25 @@ def _refitted(
 
 
 def _most_likely(responses, slopes, residual, length, scaled) -> _Force:
-    """Return the random force, of which parts have some length, s, that is most likely as the unknowns follow it."""
+    """Return the random force, of which parts have some length, s, that is most likely as the unknowns follow it.
+
+    By its restricted likelihood: what the unknowns take up of it tells nothing of its intensity (Patterson & Thompson
+    1971, "Recovery of inter-block information when block sizes are unequal").
+    """
     from scipy.optimize import minimize_scalar
 
     directions, gains, _ = np.linalg.svd(responses.T, full_matrices=False)
-    norms = np.linalg.norm(slopes, axis=1)
-    both = np.column_stack([(slopes[norms > 0.0] / norms[norms > 0.0, None]).T, residual])
+    both = np.column_stack([span(slopes), residual])
     squares, along = both.T @ both, directions.T @ both
     count = len(residual)
 
     def profiled(log_ratio):
         spread = 1.0 + np.exp(log_ratio) * gains**2
         weighed = squares - along.T @ ((1.0 - 1.0 / spread)[:, None] * along)
-        step = np.linalg.lstsq(weighed[:-1, :-1], weighed[:-1, -1], rcond=TOLD_APART**2)[0]
-        variance = max(float(weighed[-1, -1] - weighed[-1, :-1] @ step), 1e-300) / count
-        return 0.5 * (count * np.log(variance) + np.sum(np.log(spread)) + count), variance, spread
+        known, of_residual = weighed[:-1, :-1], weighed[:-1, -1]
+        variance = float(weighed[-1, -1] - of_residual @ np.linalg.solve(known, of_residual)) / count
+        volume = np.sum(np.log(spread)) + np.linalg.slogdet(known)[1]
+        return 0.5 * (count * np.log(max(variance, 1e-300)) + volume + count), variance, spread
 
     largest = np.log(1.0 / max(gains[0], 1e-300) ** 2)
     best = minimize_scalar(lambda x: profiled(x)[0], bounds=(largest - 10.0, largest + 25.0), method="bounded")

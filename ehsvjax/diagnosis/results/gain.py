@@ -1,6 +1,6 @@
 """What an extended model gains on data that it was not fitted to."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +46,8 @@ class Gain(NamedTuple):
         on: says on which data.
         left_open: for each, whether the others leave open how large the causes are: it is not predicted but fitted, by
             both models, with them.
+        predicted_by: of each cause, as they were found, whether some output is predicted better with all of them than
+            without it, and than without any, and not by chance.
 
     """
 
@@ -54,11 +56,7 @@ class Gain(NamedTuple):
     records: tuple[str, ...]
     on: str
     left_open: tuple[bool, ...]
-
-    @property
-    def predicts(self) -> bool:
-        """Whether the extended model predicts some output better than the model does, and not by chance."""
-        return not all(self.left_open) and any(g.share_interval[0] > 0.0 for g in self.outputs.values())
+    predicted_by: tuple[bool, ...]
 
 
 class _Judged(NamedTuple):
@@ -80,18 +78,40 @@ def gain_of(
     """Return the gain on validation records; without any, on each record, predicted from the others or its own past."""
     records = validation or selection.bench.records
     names = tuple(record.name for record in records)
-    left_open = tuple(not validation and selection.unused.left_open(k) for k in range(len(records)))
+    left_open = (False,) * len(records) if validation else _left_open(selection, -1)
     if validation:
         judged = [_validated(selection, nominal, extended, record) for record in validation]
         on = f"{', '.join(names)}, which {'was' if len(names) == 1 else 'were'} not used"
     else:
-        judged = [_of_record(selection, k, fitted) for k, fitted in enumerate(left_open)]
+        judged = _without(selection, -1)
         on = "each record, predicted from the others"
         if len(records) == 1:
             on = f"the last {HELD_BACK:.0%} of the record, which was held back"
     by_record = _gains(judged, rng)
     outputs = by_record[0] if len(judged) == 1 else _gains([_together(judged)], rng)[0]
-    return Gain(outputs, tuple(by_record), names, on, left_open)
+    by_all = _better(outputs) and not all(left_open)
+    predicted_by = tuple(by_all and _predicted_by(selection, 1 + k, rng) for k in range(len(selection.included)))
+    return Gain(outputs, tuple(by_record), names, on, left_open, predicted_by)
+
+
+def _better(outputs: Mapping[str, OutputGain]) -> bool:
+    """Whether some output is predicted better, and not by chance."""
+    return any(gain.share_interval[0] > 0.0 for gain in outputs.values())
+
+
+def _predicted_by(selection: Selection, without: int, rng) -> bool:
+    """Whether unused data are predicted better with all causes than with one of the sets, and not by chance."""
+    together = _together(_without(selection, without))
+    return not all(_left_open(selection, without)) and _better(_gains([together], rng)[0])
+
+
+def _left_open(selection: Selection, without: int) -> tuple[bool, ...]:
+    return tuple(selection.unused.left_open(k, without) for k in range(len(selection.bench.records)))
+
+
+def _without(selection: Selection, without: int) -> list[_Judged]:
+    """Return each record as one of the sets of causes, and as all of them, predict it."""
+    return [_of_record(selection, k, without, fitted) for k, fitted in enumerate(_left_open(selection, without))]
 
 
 def _gains(judged: Sequence[_Judged], rng) -> list[dict[str, OutputGain]]:
@@ -130,12 +150,12 @@ def _validated(selection: Selection, nominal: Fit, extended: Fit, record: Record
     )
 
 
-def _of_record(selection: Selection, record: int, fitted: bool) -> _Judged:
+def _of_record(selection: Selection, record: int, without: int, fitted: bool) -> _Judged:
     """Return one record, or the part of it that was not used: predicted, or fitted with all."""
     bench, noises, unused = selection.bench, selection.noise.of[record], selection.unused
     there = unused.noise.measured[record].any(axis=-1)
     kept = np.where(unused.noise.measured[record], 1.0, np.nan)[there]
-    both = [selection.nominal.residual[0], selection.final.residual[0]] if fitted else unused.residual[[-1, 0]]
+    both = (unused.refitted if fitted else unused.residual)[[without, 0]]
     before, after = (residual[record, there] * kept for residual in both)
     readings = bench.problem.samples.outputs[record, there] * kept
     named = [(i, n) for i, n in enumerate(bench.problem.observed) if n in bench.records[record].outputs]
