@@ -7,7 +7,7 @@ import numpy as np
 
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, SIGNIFICANT
 from ehsvjax.diagnosis.bench.noise import Noise
-from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left
+from ehsvjax.diagnosis.bench.refits import Refits, noise_of_all_left, refit
 from ehsvjax.diagnosis.decision.prediction import predicted
 from ehsvjax.diagnosis.decision.repeats import repeats_itself
 from ehsvjax.diagnosis.decision.search import Selection, without
@@ -156,7 +156,7 @@ def _chance_in(
 ) -> ProcessNoise | None:
     """Return a random force that shows in what a refit leaves, if that is chance.
 
-    What repeats itself is none, and a term of free form that is plainly more likely is a better reason.
+    What repeats itself is none, nor what a term of free form, its price paid, explains beside another such force.
 
     Args:
         selection: of the refit.
@@ -166,12 +166,15 @@ def _chance_in(
         needed: by how much it must be more likely than noise of the sensor.
 
     """
-    repeated = repeats_itself(selection.bench, refitted.residual[0], selection.noise)
+    bench, noise = selection.bench, selection.noise
+    repeated = repeats_itself(bench, refitted.residual[0], noise)
     if repeated or not force.likelihood - force.of_sensor > needed:
         return None
     if _significant(tests):
-        term, _ = missing_term(selection.bench, refitted, selection.noise, selection.seen, _suspects(tests))
-        if _likelihood(selection.noise, term) > force.likelihood + INSEPARABLE:
+        term, curve = missing_term(bench, refitted, noise, selection.seen, _suspects(tests))
+        acting = told_by(bench, refitted, noise, curve)
+        beside = process_noise(acting, refit(acting, refitted.points, refitted.chosen, noise), noise)
+        if beside is not None and beside.best - _price_of_term(noise, term) > force.likelihood + INSEPARABLE:
             return None
     return force._replace(settled=repeated is False)
 
@@ -191,8 +194,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     better = noise.gained(selection.final.residual[0], term.residual)
     better += sum(_price(selection, i) for i in causes)
     of_run = any(bench.candidates[i].effect.of_run for i in causes)
-    price = float(np.log(noise.measured.sum())) * term.pieces
-    if (term.quantity == TIME and not of_run) or not better > price + INSEPARABLE:
+    if (term.quantity == TIME and not of_run) or not better > _price_of_term(noise, term) + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
     if term.quantity == TIME:
         return term, True
@@ -205,10 +207,9 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     return term, max(contradicted) < INSEPARABLE
 
 
-def _likelihood(noise: Noise, term: MissingTerm) -> float:
-    """Return twice the logarithm of the likelihood of what a term leaves, less Bayes' price for its pieces."""
-    r = noise.innovations(term.residual)
-    return -noise.log_units - float(len(r) * (np.log(r @ r / len(r)) + 1.0) + term.pieces * np.log(len(r)))
+def _price_of_term(noise: Noise, term: MissingTerm) -> float:
+    """Return Bayes' price for the pieces of a term."""
+    return float(np.log(noise.measured.sum())) * term.pieces
 
 
 def _price(selection: Selection, candidate: int) -> float:

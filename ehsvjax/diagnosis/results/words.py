@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
+from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, how_sure
 from ehsvjax.quantities import quantity
@@ -209,8 +210,10 @@ def _cause_line(diagnosis: "Diagnosis", cause: Cause) -> str:
     said.append(how_sure(cause.probability))
     if np.isfinite(cause.gain):
         said.append(f"it gains {cause.gain:.4g} times what chance would")
+    if cause.name != PROCESS_NOISE and any({cause.name, UNKNOWN} <= {*a.causes} for a in diagnosis.alternatives):
+        said.append("data that were not used are predicted about as well without it")
     # No other record tells what each has for itself.
-    if cause.share > 0.0 and not (cause.of_run and len(diagnosis.records) > 1):
+    elif cause.share > 0.0 and not (cause.of_run and len(diagnosis.records) > 1):
         said.append(
             f"without it {100 * min(cause.share, 1.0):.0f}% of what was wrong comes back, on data that were not used"
         )
