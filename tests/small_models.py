@@ -75,6 +75,17 @@ def modulated_plant(push, period, modulation, steps=40) -> np.ndarray:
     return np.array(found)
 
 
+def one_way_plant(push, period, *, back, forth, steps=20) -> np.ndarray:
+    """Return the position [time] of a carriage that is damped otherwise on its way back, in short steps."""
+    h, x, v, found = period / steps, 0.0, 0.0, []
+    for u in push:
+        found.append(x)
+        for _ in range(steps):
+            rate = (u - (forth if v > 0.0 else back) * v - STIFFNESS * x) / MASS
+            x, v = x + h * v + 0.5 * h * h * rate, v + h * rate
+    return np.array(found)
+
+
 # --- Two tanks, as of the benchmark of cascaded tanks: pump voltage to the level of the lower one ---
 
 OUTFLOW, BETWEEN, PUMP = 0.5, 0.4, 0.6
