@@ -31,10 +31,8 @@ class Examination(NamedTuple):
         innocent: whether that is nothing.
         undecided: whether it is nothing if all that is left is noise: one record does not tell.
         chance: the random force that explains what the causes leave; None if none does.
-        chance_behind: noise variances by which a random force alone is behind all causes together, less what chance
-            would gain with these; infinite where none is about as likely.
-        behind_chance: causes that the random force stands for, name -> by how much they are less likely, where they
-            are about as likely.
+        chance_behind: of each cause, noise variances by which a random force in its place, or in that of all, is
+            behind, less what chance would gain with what it stands for; infinite where none is about as likely.
         instead: one term of free form that explains the record as well as all causes together, but for the price of
             its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
@@ -47,8 +45,7 @@ class Examination(NamedTuple):
     innocent: bool
     undecided: bool
     chance: ProcessNoise | None
-    chance_behind: float
-    behind_chance: dict[str, float]
+    chance_behind: tuple[float, ...]
     instead: MissingTerm | None
     lacking: bool
 
@@ -71,16 +68,19 @@ def examine(selection: Selection) -> Examination:
     repeated = repeats_itself(bench, selection.final.residual[0], noise) if undecided else None
     innocent = repeated is False or not _significant(after)
     force = process_noise(bench, selection.final, noise)
-    chance, chance_behind = None, np.inf
+    chance, chance_behind = None, (np.inf,) * len(selection.included)
     if force is not None:
         instead_of = _chance_instead(selection, force)
         least = min(instead_of, key=lambda causes: instead_of[causes], default=())
-        if least and instead_of[least] < 0.0:
-            return _with_rivals_of_chance(examine(without(selection, least)), least, -instead_of[least])
+        if least and instead_of[least] < -INSEPARABLE:
+            return examine(without(selection, least))
         # What no test sees must be there by the likelihood alone.
         needed = 0.0 if _significant(after) else -2.0 * float(np.log(SIGNIFICANT))
         chance = _chance_in(selection, selection.final, force, after, needed)
-        chance_behind = instead_of.get(selection.included, np.inf)
+        chance_behind = tuple(
+            min((behind for causes, behind in instead_of.items() if cause in causes), default=np.inf)
+            for cause in selection.included
+        )
     if chance is not None:
         innocent = True
     elif innocent:
@@ -90,14 +90,7 @@ def examine(selection: Selection) -> Examination:
     if lacking and chance is not None:
         innocent = False
     still_open = undecided and repeated is None
-    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, {}, instead, lacking)
-
-
-def _with_rivals_of_chance(examined: Examination, causes: tuple[int, ...], behind: float) -> Examination:
-    if examined.chance is None or examined.chance.settled or not behind < INSEPARABLE:
-        return examined
-    rivals = {examined.selection.bench.candidates[cause].name: behind for cause in causes}
-    return examined._replace(behind_chance=examined.behind_chance | rivals)
+    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, instead, lacking)
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:

@@ -9,6 +9,7 @@ from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, probabilities
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.examination import Examination
 from ehsvjax.diagnosis.decision.search import Need, Selection
+from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.readings import lattice
 
 QUANTISATION = "sensor_quantisation"
@@ -65,7 +66,7 @@ def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     if examined.lacking or not (examined.innocent or groups):
         return Verdict("unexplained", (), (), ())
     others = [{name: 1.0} for name in _quantised(selection)]
-    others += [_chance(examined)] if examined.chance else []
+    others += [_chance(examined.chance)] if examined.chance else []
     included = (*(selection.included[k] for k in order), *(None for _ in others))
     every = (*groups, *others)
     if not every:
@@ -83,18 +84,19 @@ def _or_unknown(group: Mapping[str, float]) -> dict[str, float]:
 def _group(examined: Examination, k: int) -> dict[str, float]:
     """Return what could be there as one of the causes, the best first, with probabilities.
 
-    Against each other, against a random force in the place of them all, and against nothing.
+    Against each other, against a random force in its place or that of them all, and against nothing.
     """
     selection = examined.selection
     rivals, need = selection.rivals[k], selection.needs[k]
     deficits = [rival.deficit for rival in rivals]
-    every = probabilities([*deficits, examined.chance_behind, _nothing_behind(need)])
+    chance_behind = examined.chance_behind[k]
+    every = probabilities([*deficits, chance_behind, _nothing_behind(need)])
     found: dict[str, float] = {}
     for rival, probable in zip(rivals, every, strict=False):
         name = selection.bench.candidates[rival.candidate].name
         if rival.deficit < INSEPARABLE:
             found[name] = found.get(name, 0.0) + float(probable)
-    if np.isfinite(examined.chance_behind):
+    if np.isfinite(chance_behind):
         found[PROCESS_NOISE] = float(every[len(rivals)])
     return found
 
@@ -104,14 +106,12 @@ def _nothing_behind(need: Need) -> float:
     return need.gain - need.required
 
 
-def _chance(examined: Examination) -> dict[str, float]:
-    """Return what may be there of chance, and what is about as likely.
-
-    Unless the experiment was repeated, nothing speaks for chance against a term that the bank lacks.
+def _chance(chance: ProcessNoise) -> dict[str, float]:
+    """Return what may be there of chance: unless the experiment was repeated, nothing speaks for it against a term that
+    the bank lacks.
     """
-    behind = {PROCESS_NOISE: 0.0, **examined.behind_chance}
-    found = dict(zip(behind, probabilities([*behind.values()]).tolist(), strict=True))
-    return found if examined.chance is not None and examined.chance.settled else _or_unknown(found)
+    certain = {PROCESS_NOISE: 1.0}
+    return certain if chance.settled else _or_unknown(certain)
 
 
 def _quantised(selection: Selection) -> tuple[str, ...]:
