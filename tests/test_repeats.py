@@ -6,8 +6,10 @@ import pytest
 
 import ehsvjax
 from ehsvjax.diagnosis import recipe
+from ehsvjax.diagnosis.decision.prediction import Predicted
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN, verdict_of
 from ehsvjax.diagnosis.results.explanations import explanations_of
+from ehsvjax.diagnosis.results.gain import gain_of
 from tests.small_models import carriage, carriage_plant, record_of
 
 PERIOD, SAMPLES, KEY = 0.02, 1500, jax.random.key(0)
@@ -54,6 +56,11 @@ def test_what_leaves_something_and_predicts_nothing_may_stand_for_what_the_bank_
     found = diagnosed([shaken(3.0, 1)])
     ((examined, predicted_by),) = given
     assert predicted_by == found.gain.predicted_by == (True,) and found.innocent, str(found)
+    # What is fitted, as the rest leaves it open, is not predicted.
+    with monkeypatch.context() as patched:
+        patched.setattr(Predicted, "left_open", lambda *_: True)
+        fits = found.fit, found.extended
+        assert gain_of(examined.selection, *fits, (), np.random.default_rng(0)).predicted_by == (False,)
     left = examined._replace(innocent=False)
     sure, unsure = (verdict_of(left, told) for told in ((True,), (False,)))
     for group, open_group in zip(sure.groups, unsure.groups, strict=True):

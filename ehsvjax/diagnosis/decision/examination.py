@@ -167,7 +167,7 @@ def _chance_in(
         term, curve = missing_term(bench, refitted, noise, selection.seen, _suspects(tests))
         acting = told_by(bench, refitted, noise, curve)
         beside = process_noise(acting, refit(acting, refitted.points, refitted.chosen, noise), noise)
-        if beside is not None and beside.best - _price_of_term(noise, term) > force.likelihood + INSEPARABLE:
+        if beside is not None and beside.best - _bayes_price(noise, term.pieces) > force.likelihood + INSEPARABLE:
             return None
     return force._replace(settled=repeated is False)
 
@@ -187,7 +187,7 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     better = noise.gained(selection.final.residual[0], term.residual)
     better += sum(_price(selection, i) for i in causes)
     of_run = any(bench.candidates[i].effect.of_run for i in causes)
-    if (term.quantity == TIME and not of_run) or not better > _price_of_term(noise, term) + INSEPARABLE:
+    if (term.quantity == TIME and not of_run) or not better > _bayes_price(noise, term.pieces) + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
     if term.quantity == TIME:
         return term, True
@@ -200,9 +200,8 @@ def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: boo
     return term, max(contradicted) < INSEPARABLE
 
 
-def _price_of_term(noise: Noise, term: MissingTerm) -> float:
-    """Return Bayes' price for the pieces of a term."""
-    return float(np.log(noise.measured.sum())) * term.pieces
+def _bayes_price(noise: Noise, numbers: float) -> float:
+    return float(np.log(noise.measured.sum())) * numbers
 
 
 def _price(selection: Selection, candidate: int) -> float:
@@ -211,5 +210,5 @@ def _price(selection: Selection, candidate: int) -> float:
     A record fixes a frequency sharply: its information grows with the third power of the record's length (Djuric 1996,
     "A model selection rule for sinusoids in white Gaussian noise").
     """
-    per_number = float(np.log(selection.noise.measured.sum()))
-    return per_number * selection.bench.numbers_of(candidate) + selection.bench.search_of(candidate)
+    bench = selection.bench
+    return _bayes_price(selection.noise, bench.numbers_of(candidate)) + bench.search_of(candidate)

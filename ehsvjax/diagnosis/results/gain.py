@@ -78,12 +78,12 @@ def gain_of(
     """Return the gain on validation records; without any, on each record, predicted from the others or its own past."""
     records = validation or selection.bench.records
     names = tuple(record.name for record in records)
-    left_open = (False,) * len(records) if validation else _left_open(selection, -1)
     if validation:
+        left_open = (False,) * len(records)
         judged = [_validated(selection, nominal, extended, record) for record in validation]
         on = f"{', '.join(names)}, which {'was' if len(names) == 1 else 'were'} not used"
     else:
-        judged = _without(selection, -1)
+        left_open, judged = _without(selection, -1)
         on = "each record, predicted from the others"
         if len(records) == 1:
             on = f"the last {HELD_BACK:.0%} of the record, which was held back"
@@ -101,17 +101,14 @@ def _better(outputs: Mapping[str, OutputGain]) -> bool:
 
 def _predicted_by(selection: Selection, without: int, rng) -> bool:
     """Whether unused data are predicted better with all causes than with one of the sets, and not by chance."""
-    together = _together(_without(selection, without))
-    return not all(_left_open(selection, without)) and _better(_gains([together], rng)[0])
+    left_open, judged = _without(selection, without)
+    return not all(left_open) and _better(_gains([_together(judged)], rng)[0])
 
 
-def _left_open(selection: Selection, without: int) -> tuple[bool, ...]:
-    return tuple(selection.unused.left_open(k, without) for k in range(len(selection.bench.records)))
-
-
-def _without(selection: Selection, without: int) -> list[_Judged]:
-    """Return each record as one of the sets of causes, and as all of them, predict it."""
-    return [_of_record(selection, k, without, fitted) for k, fitted in enumerate(_left_open(selection, without))]
+def _without(selection: Selection, without: int) -> tuple[tuple[bool, ...], list[_Judged]]:
+    """Return which records are left open, and each as one of the sets of causes, and as all of them, predict it."""
+    left_open = tuple(selection.unused.left_open(k, without) for k in range(len(selection.bench.records)))
+    return left_open, [_of_record(selection, k, without, fitted) for k, fitted in enumerate(left_open)]
 
 
 def _gains(judged: Sequence[_Judged], rng) -> list[dict[str, OutputGain]]:
