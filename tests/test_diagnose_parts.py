@@ -137,6 +137,21 @@ def test_slow_noise_is_known_although_most_of_it_lies_in_the_space_of_the_causes
     assert 0.75 < np.mean(found) < 1.1
 
 
+def test_noise_is_followed_where_its_order_changes_on_the_way():
+    """The order is found anew in each round; where it falls from two to one the change is larger than the last."""
+    count, pole = 1500, 0.85
+    phases = 2.0 * np.pi * np.outer(np.arange(1, 61), np.arange(count)) / count
+    slow = np.concatenate([np.cos(phases), np.sin(phases)])[:, None, :, None]
+    found = []
+    for seed in range(12):
+        white = np.random.default_rng(seed).standard_normal(count + 500)
+        noise = (1.0 - pole**2) ** 0.5 * lfilter([1.0], [1.0, -pole], white)[500:]
+        ((of_record,),) = noise_outside(noise[None, :, None], np.ones((1, count, 1), bool), [slow]).of
+        found.append(of_record.variance)
+    assert 0.75 < np.mean(found) < 1.25
+    assert min(found) > 0.6
+
+
 def test_noise_is_never_more_than_the_whole_residual():
     """A random walk outside the space of causes is followed no further than the residual goes."""
     count, rng = 1000, np.random.default_rng(3)
