@@ -138,6 +138,8 @@ SIZES: dict[str, dict[str, float]] = {
     "constant_force": {"force": 0.1},
     "coulomb_friction force": {"force": 0.1},
     "stribeck_friction force": {"force": 0.2, "velocity": 0.5},
+    "elastic_friction": {"stiffness": 0.4, "length": 0.3, "softening": 0.0},
+    "one_way_damping": {"coefficient": 0.1},
     "linear_damping": {"coefficient": 0.1},
     "quadratic_damping": {"coefficient": 0.05},
     "rayleigh_damping": {"coefficient": 0.02},

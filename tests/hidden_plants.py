@@ -64,6 +64,8 @@ VAN_DER_POL_EFFECTS = {
     "rayleigh_damping": {"coefficient": (0.0, 1e-3, 0.01)},
     "quadratic_damping": {"coefficient": (0.0, 2e-3, 0.025)},
     "coulomb_friction": {"force": (0.0, 0.01, 0.1)},
+    "elastic_friction": {"stiffness": (0.0, 0.05, 0.4), "length": (1.0, 0.1, 0.4)},
+    "one_way_damping": {"coefficient": (0.0, 0.01, 0.1)},
     "asymmetric_damping": {"offset": (0.0, 0.01, 0.09)},
     "damping_threshold": {"threshold": (1.0, 1.01, 1.12)},
     "constant_force": {"force": (0.0, 0.01, 0.08)},
@@ -218,12 +220,12 @@ def van_der_pol_with(
     # A static nonlinearity of the input commutes with its delay and with holding it.
     command = _shaped_input(command, sizes)
     delayed = _delayed_command(command, sizes, step, substeps)
-    input_lag, sensor_lag = sizes.get("input_lag"), sizes.get("sensor_lag")
+    input_lag, sensor_lag, dahl = sizes.get("input_lag"), sizes.get("sensor_lag"), sizes.get("elastic_friction")
     acceleration = _smooth_acceleration(duration, gamma, sizes)
     kicks = _process_noise(sizes, samples * substeps, step)
 
     x1, x2 = np.broadcast_to(np.asarray(initial, dtype=float), (batch, 2)).T.copy()
-    lagged, sensed = np.zeros(batch), x1
+    lagged, stretch, sensed = np.zeros(batch), np.zeros(batch), x1
     position, velocity = np.empty((2, samples, batch))
     for sample in range(samples):
         position[sample], velocity[sample] = sensed, x2
@@ -235,12 +237,25 @@ def van_der_pol_with(
                 inputs = (start, *(held + (start - held) * _decay(t, input_lag) for t in (0.5 * step, step)))
                 lagged = inputs[2]
             before = x1
+            if dahl is not None:
+                rising = acceleration(x1, x2, time, inputs[0] - dahl[0] * stretch)
+                ahead = _dahl(stretch, alpha * step * (x2 + 0.5 * step * rising), dahl[1])
+                courses = (stretch, 0.5 * (stretch + ahead), ahead)
+                inputs = tuple(drive - dahl[0] * course for drive, course in zip(inputs, courses, strict=True))
             x1, x2 = _van_der_pol_step(x1, x2, time, step, inputs, acceleration, alpha, sizes)
+            if dahl is not None:
+                stretch = _dahl(stretch, x1 - before, dahl[1])
             if kicks is not None:
                 x2 = x2 + kicks[sample * substeps + substep]
             sensed = x1 if sensor_lag is None else _lagged(sensed, before, x1, sensor_lag, step)
     position = _sensed_position(position.T, np.arange(samples) / samples, sizes)
     return {"position": position, "velocity": velocity.T}
+
+
+def _dahl(stretch, way, length):
+    """Stretch of what slides at a length, after a way: the midpoint rule."""
+    middle = stretch + 0.5 * (way - np.abs(way) * stretch / length)
+    return stretch + way - np.abs(way) * middle / length
 
 
 def _sizes_over_batch(effects, known):
@@ -503,6 +518,7 @@ def _smooth_acceleration(duration, gamma, sizes):
     get = sizes.get
     offset, threshold = get("asymmetric_damping", 0.0), get("damping_threshold", 1.0)
     drift, linear, constant = get("parameter_drift", 0.0), get("linear_damping", 0.0), get("constant_force", 0.0)
+    one_way = get("one_way_damping", 0.0)
     powers = [
         (get(effect + "_stiffness"), power)
         for effect, power in (("quadratic", 2), ("cubic", 3), ("quintic", 5))
@@ -515,7 +531,7 @@ def _smooth_acceleration(duration, gamma, sizes):
             damping = damping - sizes["rayleigh_damping"] * x2 * x2
         if "quadratic_damping" in sizes:
             damping = damping - sizes["quadratic_damping"] * np.abs(x2)
-        force = u + constant - x1
+        force = u + constant - x1 - one_way * np.abs(x2)
         for coefficient, power in powers:
             force = force - coefficient * x1**power
         if "harmonic_force" in sizes:

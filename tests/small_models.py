@@ -86,6 +86,25 @@ def one_way_plant(push, period, *, back, forth, steps=20) -> np.ndarray:
     return np.array(found)
 
 
+def hysteretic_plant(push, period, *, stiffness, beta, gamma, steps=20) -> np.ndarray:
+    """Return the position [time] of a carriage on a spring of Bouc and Wen beside its own, in steps of Runge-Kutta."""
+
+    def rates(state, u):
+        x, v, z = state
+        force = u - DAMPING * v - STIFFNESS * x - stiffness * z
+        return np.array([v, force / MASS, v - beta * abs(v) * z - gamma * v * abs(z)])
+
+    h, state, found = period / steps, np.zeros(3), []
+    for u in push:
+        found.append(state[0])
+        for _ in range(steps):
+            first = rates(state, u)
+            second = rates(state + 0.5 * h * first, u)
+            third = rates(state + 0.5 * h * second, u)
+            state = state + h / 6.0 * (first + 2.0 * second + 2.0 * third + rates(state + h * third, u))
+    return np.array(found)
+
+
 # --- Two tanks, as of the benchmark of cascaded tanks: pump voltage to the level of the lower one ---
 
 OUTFLOW, BETWEEN, PUMP = 0.5, 0.4, 0.6

@@ -47,6 +47,8 @@ RENAMED = {
     ("input_dead_zone", "width"): lambda width: {"half_width": width},
     ("spool_rate_limit", "rate"): lambda rate: {"limit": rate},
     ("structural_flexibility", "stiffness"): lambda stiffness: {"compliance": 1.0 / stiffness},
+    # The plant's ends where it began to give.
+    ("elastic_friction", "length"): lambda length: {"length": length, "softening": 0.0},
     ("end_stop", "position"): lambda position: {"positive_end": position},
     ("end_stop", "stiffness"): lambda stiffness: {"positive_stiffness": stiffness},
 }

@@ -13,7 +13,18 @@ from ehsvjax.diagnosis import diagnose
 from ehsvjax.effects import BANK, attach, candidates
 from ehsvjax.effects.internal import contexts_of
 from tests.plants import held_levels
-from tests.small_models import OUTFLOW, PUMP, carriage, carriage_plant, damper, record_of, tanks, tanks_plant
+from tests.small_models import (
+    OUTFLOW,
+    PUMP,
+    carriage,
+    carriage_plant,
+    damper,
+    hysteretic_plant,
+    one_way_plant,
+    record_of,
+    tanks,
+    tanks_plant,
+)
 
 # One process compiles.
 pytestmark = pytest.mark.xdist_group("diagnoses of a carriage")
@@ -128,6 +139,39 @@ def test_a_force_that_acts_in_what_is_measured_alone_is_named():
     found = diagnosed(damper(), record_of(0.01, {"displacement": moved}, {"force": force}, {"force": 1.0}, 3))
     assert found.names == ("coulomb_friction",), str(found)
     assert found.extended.parameters["coulomb_friction.force"] == pytest.approx(30.0, rel=0.02)
+
+
+# --- Forces ---
+
+
+def walk(seed, samples, rms):
+    """Return a push that wanders and comes back."""
+    push = np.cumsum(np.random.default_rng(seed).normal(0.0, 1.0, samples))
+    push -= np.linspace(push[0], push[-1], samples)
+    return rms * push / push.std()
+
+
+def test_a_damper_that_is_stiffer_one_way_is_named():
+    push = walk(2, 1500, 8.0)
+    position = one_way_plant(push, 0.02, back=1.5, forth=4.5, steps=200)
+    found = diagnosed(carriage(), record_of(0.02, {"push": push}, {"position": position}, {"position": 2e-4}, 3))
+    assert found.names == ("one_way_damping",), str(found)
+    assert found.extended.parameters["one_way_damping.coefficient"] == pytest.approx(1.5, rel=0.03)
+    assert found.extended.parameters["damping"] == pytest.approx(3.0, rel=0.03)
+
+
+@pytest.mark.parametrize(("beta", "gamma"), [(10.0, 0.0), (8.0, -11.0)])
+def test_a_spring_with_hysteresis_is_named(beta, gamma):
+    """Dry friction that gives before it slides, and a spring that hardens; no cubic spring, no quadratic damping."""
+    push = walk(5, 1500, 8.0)
+    position = hysteretic_plant(push, 0.02, stiffness=30.0, beta=beta, gamma=gamma)
+    found = diagnosed(carriage(), record_of(0.02, {"push": push}, {"position": position}, {"position": 2e-4}, 4))
+    assert found.names == ("elastic_friction",), str(found)
+    numbers = {"stiffness": 30.0, "length": 1.0 / beta, "softening": gamma / beta}
+    for number, value in numbers.items():
+        name = f"elastic_friction.{number}"
+        off_by = found.extended.parameters[name] - value
+        assert abs(off_by) < 4.0 * found.extended.standard_errors[name], str(found)
 
 
 def test_a_sensor_that_shows_a_part_of_the_input_at_once_is_named():

@@ -6,6 +6,7 @@ import math
 import jax.numpy as jnp
 
 from ehsvjax.effects.effect import PROBED, UNLIMITED, Effect, EffectParameter, Scales, amplitude, shape, size
+from ehsvjax.effects.hysteresis import elastic_friction
 
 # Stiffness of an end stop over that of the machine: a softer one is a spring, a stiffer one a wall.
 _STOP_STIFFNESS, _SOFTEST, _STIFFEST = (6.0, 18.0, 60.0), 0.1, 200.0
@@ -232,6 +233,15 @@ FORCE = (
         needs=("velocity",),
         says="dry friction that is larger at small velocities",
         settled_by="slow motion in both directions",
+    ),
+    elastic_friction(_per("position", 1)),
+    _force(
+        "one_way_damping",
+        (amplitude("coefficient", "{value}/({length}/s)", _per("velocity", 1)),),
+        lambda own, context: own["coefficient"] * jnp.abs(context["velocity"]),
+        needs=("velocity",),
+        says="a damper that is stiffer one way",
+        settled_by=_TWO_AMPLITUDES,
     ),
     _force(
         "linear_damping",
