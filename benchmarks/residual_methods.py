@@ -59,10 +59,11 @@ def correlation_test(fit: ehsvjax.Fit, record: ehsvjax.Record) -> Answer:
 _THINNED, _CONVINCING = 400, 10.0  # samples; of log marginal likelihood, strong evidence on any scale
 _ACTS_THROUGH: Mapping[str, str] = {
     "position": "hardening_spring end_stop sensor_saturation sensor_cubic sensor_gain sensor_quantisation "
-    "cubic_stiffness quintic_stiffness quadratic_stiffness damping_threshold asymmetric_damping",
+    "sensor_asymmetry cubic_stiffness quintic_stiffness quadratic_stiffness damping_threshold asymmetric_damping "
+    "elastic_friction",
     "velocity": "coulomb_friction stribeck_friction viscous_friction area_asymmetry sensor_lag feedback_backlash "
     "torque_motor_hysteresis transport_delay supply_droop structural_flexibility linear_damping rayleigh_damping "
-    "quadratic_damping asymmetric_damping damping_threshold input_lag",
+    "quadratic_damping asymmetric_damping damping_threshold input_lag one_way_damping elastic_friction",
     "command": "input_gain input_lag input_dead_zone input_saturation transport_delay",
     "spool": "null_bias asymmetric_dead_zone null_leakage flow_gain_rounding flow_gain_curvature spool_rate_limit "
     "torque_motor_hysteresis",
@@ -219,6 +220,10 @@ def _of_oscillator(fit, record) -> Discrepancy:
         "x v": (x * v, "asymmetric_damping sensor_bias"),
         "v |v|": (v * np.abs(v), "quadratic_damping"),
         "v^3": (v**3, "rayleigh_damping"),
+        "|v|": (np.abs(v), "one_way_damping"),
+        "slides at .1": (_sliding(x, 0.1), "elastic_friction"),
+        "slides at .4": (_sliding(x, 0.4), "elastic_friction"),
+        "|x|": (np.abs(x), "sensor_asymmetry"),
         "sign v": (np.sign(v), "coulomb_friction"),
         "a": (a, "sensor_lag"),
         "u": (u, "input_gain sensor_gain"),
@@ -232,6 +237,15 @@ def _of_oscillator(fit, record) -> Discrepancy:
     }
     columns |= _harmonics(term, record, {"": np.ones_like(x), "x ": x}, "harmonic_force", "parametric_excitation")
     return Discrepancy(term, columns, (u - x, (1.0 - x**2) * v), window)
+
+
+def _sliding(x, length):
+    """Return the stretch of what slides at a length."""
+    stretch = np.zeros_like(x)
+    for k, way in enumerate(np.diff(x)):
+        end = np.sign(way) * length
+        stretch[k + 1] = end + (stretch[k] - end) * np.exp(-np.abs(way) / length)
+    return stretch
 
 
 def _of_valve(fit, record) -> Discrepancy:
@@ -272,6 +286,7 @@ def _of_valve(fit, record) -> Discrepancy:
         "opening: sign of its rate": (by_opening * np.sign(spool_rate), "torque_motor_hysteresis"),
         "opening: sign v": (by_opening * moves, "feedback_backlash"),
         "opening: x": (by_opening * driven(x), "sensor_gain"),
+        "opening: |x|": (by_opening * driven(np.abs(x)), "sensor_asymmetry"),
         "opening: v": (by_opening * driven(v), "sensor_lag"),
         "opening: command's rate": (by_opening * (driven(np.r_[0.0, np.diff(record.inputs["command"])]) / period),
                                     "transport_delay"),

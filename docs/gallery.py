@@ -106,6 +106,7 @@ SIZES: dict[str, dict[str, float]] = {
     "input_hysteresis": {"half_width": 1.5e-4},
     "sensor_gain": {"error": 0.02},
     "sensor_bias": {"bias": 1e-3},
+    "sensor_asymmetry": {"error": 0.03},
     "sensor_drift": {"drift": 1e-3},
     "sensor_cubic": {"coefficient": 10.0},
     "sensor_saturation": {"limit": 0.03},

@@ -36,6 +36,7 @@ SERVOVALVE_EFFECTS = {
     "transport_delay": {"delay": (0.0, 1e-3, 5e-3)},
     "sensor_lag": {"time_constant": (0.0, 1e-3, 5e-3)},
     "sensor_gain": {"error": (0.0, 2e-3, 2e-2)},
+    "sensor_asymmetry": {"error": (0.0, 2e-3, 2e-2)},
     "sensor_bias": {"bias": (0.0, 1e-4, 1e-3)},
     "sensor_drift": {"drift": (0.0, 2e-4, 2e-3)},
     "sensor_saturation": {"limit": (np.inf, 0.03, 0.05)},
@@ -79,6 +80,7 @@ VAN_DER_POL_EFFECTS = {
     "parametric_excitation": {"depth": (0.0, 0.02, 0.1), "frequency": (0.0, 0.3, 5.0), "phase": ANY_PHASE},
     "sensor_bias": {"bias": (0.0, 0.02, 0.2)},
     "sensor_gain": {"error": (0.0, 0.01, 0.1)},
+    "sensor_asymmetry": {"error": (0.0, 0.01, 0.1)},
     "sensor_cubic": {"coefficient": (0.0, 5e-3, 0.05)},
     "sensor_saturation": {"limit": (np.inf, 1.5, 1.9)},
     "sensor_lag": {"time_constant": (0.0, 0.02, 0.2)},
@@ -488,6 +490,7 @@ def _sensed_position(position, fraction, sizes):
         return sizes.get(effect, np.full(1, absent))[:, None]
 
     position = position + size("sensor_cubic") * position**3
+    position = np.where(position < 0.0, (1.0 + size("sensor_asymmetry")) * position, position)
     position = (1.0 + size("sensor_gain")) * position + size("sensor_bias") + size("sensor_drift") * fraction
     limit = size("sensor_saturation", np.inf)
     return _clipped(position, -limit, limit)

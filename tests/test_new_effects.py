@@ -182,6 +182,16 @@ def test_a_sensor_that_shows_a_part_of_the_input_at_once_is_named():
     assert found.extended.parameters["feedthrough_of_push.gain"] == pytest.approx(1e-3, rel=0.05)
 
 
+@pytest.mark.parametrize("gain", [0.97, -1.0])
+def test_a_sensor_that_shows_one_side_otherwise_or_without_its_sign_is_named(gain):
+    push = held_levels(7, 20.0, SAMPLES // 20, 20) + 4.0
+    position = carriage_plant(push, PERIOD)[:, 0]
+    shown = np.where(position < 0.0, gain * position, position)
+    found = diagnosed(carriage(), record_of(PERIOD, {"push": push}, {"position": shown}, NOISE, 8))
+    assert found.names == ("sensor_asymmetry",), str(found)
+    assert found.extended.parameters["sensor_asymmetry.error"] == pytest.approx(gain - 1.0, rel=0.05)
+
+
 def test_every_input_may_reach_every_sensor_that_is_measured():
     found = {c.name for c in attached_candidates(carriage(), ("position", "velocity"))}
     assert {"feedthrough_of_push@position", "feedthrough_of_push@velocity"} <= found

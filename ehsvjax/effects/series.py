@@ -267,6 +267,14 @@ SENSOR = (
         settled_by="an external gauge at several levels",
     ),
     Effect(
+        "sensor_asymmetry",
+        "sensor",
+        (amplitude("error", "", constant(1e-3), constant(-2.0), constant(9.0)),),
+        lambda own, y, context: y + own["error"] * jnp.minimum(y, 0.0),
+        says="the sensor shows what is negative more or less than what is positive; at -2 as positive",
+        settled_by="an external gauge on both sides of zero",
+    ),
+    Effect(
         "sensor_saturation",
         "sensor",
         (limit("limit", "{value}", (0.98, 0.93, 0.85, 0.7, 0.5)),),
