@@ -1,12 +1,14 @@
 """Friction that gives like a spring before it slides, or a spring with hysteresis."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 
-from ehsvjax.effects.effect import Effect, constant, shape, size
+from ehsvjax.effects.effect import Effect, Scales, constant, shape, size
 
 
-def elastic_friction(stiffness) -> Effect:
-    """Return the effect on a force; its size is that of a spring, of which the scales know a small one.
+def elastic_friction(stiffness: Callable[[Scales], float]) -> Effect:
+    """Return the effect on a force, with a small stiffness to try, from the scales.
 
     Of Bouc (1967, "Forced vibration of mechanical systems with hysteresis") and Wen (1976) with exponent one, which is
     the friction of Dahl (1968, "A solid friction model") where the spring does not soften. What is stretched by u moves
