@@ -75,6 +75,13 @@ def modulated_plant(push, period, modulation, steps=40) -> np.ndarray:
     return np.array(found)
 
 
+def wandering(rng, samples, rms) -> np.ndarray:
+    """Return a push [time] that wanders and comes back."""
+    push = np.cumsum(rng.normal(0.0, 1.0, samples))
+    push -= np.linspace(push[0], push[-1], samples)
+    return push * (rms / push.std())
+
+
 def one_way_plant(push, period, *, back, forth, steps=20) -> np.ndarray:
     """Return the position [time] of a carriage that is damped otherwise on its way back, in short steps."""
     h, x, v, found = period / steps, 0.0, 0.0, []

@@ -93,6 +93,12 @@ def test_held_levels_are_no_lattice():
 # --- Noise ---
 
 
+def slow_waves(number, count):
+    """Return the cosines and sines of the first frequencies of a record."""
+    phases = 2.0 * np.pi * np.outer(np.arange(1, number + 1), np.arange(count)) / count
+    return np.concatenate([np.cos(phases), np.sin(phases)])[:, None, :, None]
+
+
 def test_whitened_noise_is_white_also_at_its_beginning():
     poles = np.array([1.0, -0.7])
     many = lfilter([1.0], poles, np.random.default_rng(3).standard_normal((4000, 220)), axis=1)[:, 200:]
@@ -130,8 +136,7 @@ def test_slow_noise_is_known_although_most_of_it_lies_in_the_space_of_the_causes
     found = []
     for _ in range(8):
         noise = (1.0 - pole**2) ** 0.5 * lfilter([1.0], [1.0, -pole], rng.standard_normal(count + 500))[500:]
-        phases = 2.0 * np.pi * np.outer(np.arange(1, 41), np.arange(count)) / count
-        slow = np.concatenate([np.cos(phases), np.sin(phases)])[:, None, :, None]
+        slow = slow_waves(40, count)
         ((of_record,),) = noise_outside(noise[None, :, None], np.ones((1, count, 1), bool), [slow]).of
         found.append(of_record.variance)
     assert 0.75 < np.mean(found) < 1.1
@@ -140,8 +145,7 @@ def test_slow_noise_is_known_although_most_of_it_lies_in_the_space_of_the_causes
 def test_noise_is_followed_where_its_order_changes_on_the_way():
     """The order is found anew in each round; where it falls from two to one the change is larger than the last."""
     count, pole = 1500, 0.85
-    phases = 2.0 * np.pi * np.outer(np.arange(1, 61), np.arange(count)) / count
-    slow = np.concatenate([np.cos(phases), np.sin(phases)])[:, None, :, None]
+    slow = slow_waves(60, count)
     found = []
     for seed in range(12):
         white = np.random.default_rng(seed).standard_normal(count + 500)
@@ -155,8 +159,7 @@ def test_noise_is_followed_where_its_order_changes_on_the_way():
 def test_noise_is_never_more_than_the_whole_residual():
     """A random walk outside the space of causes is followed no further than the residual goes."""
     count, rng = 1000, np.random.default_rng(3)
-    phases = 2.0 * np.pi * np.outer(np.arange(1, 31), np.arange(count)) / count
-    slow = np.concatenate([np.cos(phases), np.sin(phases)])[:, None, :, None]
+    slow = slow_waves(30, count)
     for _ in range(5):
         walk = np.cumsum(rng.standard_normal(count))
         walk = (walk - walk.mean())[None, :, None]

@@ -24,6 +24,7 @@ from tests.small_models import (
     record_of,
     tanks,
     tanks_plant,
+    wandering,
 )
 
 # One process compiles.
@@ -144,15 +145,8 @@ def test_a_force_that_acts_in_what_is_measured_alone_is_named():
 # --- Forces ---
 
 
-def walk(seed, samples, rms):
-    """Return a push that wanders and comes back."""
-    push = np.cumsum(np.random.default_rng(seed).normal(0.0, 1.0, samples))
-    push -= np.linspace(push[0], push[-1], samples)
-    return rms * push / push.std()
-
-
 def test_a_damper_that_is_stiffer_one_way_is_named():
-    push = walk(2, 1500, 8.0)
+    push = wandering(np.random.default_rng(2), 1500, 8.0)
     position = one_way_plant(push, 0.02, back=1.5, forth=4.5, steps=200)
     found = diagnosed(carriage(), record_of(0.02, {"push": push}, {"position": position}, {"position": 2e-4}, 3))
     assert found.names == ("one_way_damping",), str(found)
@@ -163,7 +157,7 @@ def test_a_damper_that_is_stiffer_one_way_is_named():
 @pytest.mark.parametrize(("beta", "gamma"), [(10.0, 0.0), (8.0, -11.0)])
 def test_a_spring_with_hysteresis_is_named(beta, gamma):
     """Dry friction that gives before it slides, and a spring that hardens; no cubic spring, no quadratic damping."""
-    push = walk(5, 1500, 8.0)
+    push = wandering(np.random.default_rng(5), 1500, 8.0)
     position = hysteretic_plant(push, 0.02, stiffness=30.0, beta=beta, gamma=gamma)
     found = diagnosed(carriage(), record_of(0.02, {"push": push}, {"position": position}, {"position": 2e-4}, 4))
     assert found.names == ("elastic_friction",), str(found)

@@ -8,7 +8,7 @@ import ehsvjax
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.effects import BANK
 from tests.hidden_records import Hidden, records
-from tests.small_models import ball, carriage, one_way_plant, shaken_ball
+from tests.small_models import ball, carriage, one_way_plant, shaken_ball, wandering
 
 pytestmark = pytest.mark.xdist_group("diagnoses of a ball")
 PERIOD, SAMPLES, NOISE = 0.1, 336, 5e-4
@@ -67,9 +67,7 @@ def test_a_weak_force_on_an_oscillator_is_no_periodic_one():
 def test_a_damper_that_is_stiffer_one_way_is_no_random_force():
     """Not in a bank without: drawn along a motion that is 5% off, the term alone leaves a trace, and chance nothing."""
     rng = np.random.default_rng(2)
-    push = np.cumsum(rng.normal(0.0, 1.0, 1500))
-    push -= np.linspace(push[0], push[-1], len(push))
-    push *= 8.0 / push.std()
+    push = wandering(rng, 1500, 8.0)
     position = one_way_plant(push, 0.02, back=1.5, forth=4.5) + rng.normal(0.0, 2e-4, len(push))
     record = ehsvjax.Record(0.02 * np.arange(len(push)), {"push": push}, {"position": position})
     model = carriage().with_bounds({"stiffness": (10.0, 100.0)})
