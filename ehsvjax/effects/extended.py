@@ -2,7 +2,7 @@
 
 import functools
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -50,8 +50,8 @@ def extended(
         duration: s over which drifts are counted.
         disturbed: signals to which a series of any form can be added: the model has an input `disturbance(name)` for
             each of them.
-        switched: whether the effects at a signal can be skipped: the model has a constant `switch(name)` for each
-            signal that effects act on while it runs; where it is zero they are not computed.
+        switched: whether each effect can be skipped: the model has a constant `switch(candidate)` for each that acts on
+            what runs along a signal; where it is zero the effect is not computed.
 
     """
     equations = _equations(model.equations, tuple(attached), tuple(disturbed), switched)
@@ -59,9 +59,7 @@ def extended(
         Parameter(DURATION, "T", "s", duration, 0.0, 1e9, fixed=True, certain=True),
     ]  # fmt: skip
     if switched:
-        constants += [
-            Parameter(switch(name), "on", "", 1.0, 0.0, 1.0, fixed=True, certain=True) for name in effects_at(attached)
-        ]
+        constants += [Parameter(name, "on", "", 1.0, 0.0, 1.0, fixed=True, certain=True) for name in switches(attached)]
     own = tuple(parameters[c.parameter(p.name)] for c in attached for p in c.effect.parameters)
     # An end stop on either side is the same effect twice.
     names = tuple(dict.fromkeys([*effects_of(model), *(c.name for c in attached)]))
@@ -85,18 +83,21 @@ def disturbance(signal: str) -> str:
     return f"disturbance of {signal}"
 
 
-def switch(signal: str) -> str:
-    """Name of the constant that is zero where no effect acts at a signal."""
-    return f"effects at {signal}"
+def switch(candidate: Candidate) -> str:
+    """Name of the constant that is zero where an effect is skipped; that of the two forms of one effect is the same."""
+    return f"whether {candidate.name} acts"
 
 
-def effects_at(attached: Sequence[Candidate]) -> dict[str, list[Candidate]]:
-    """Return the effects on what runs along the model's signals, by the signal at which they act."""
-    at_signal: dict[str, list[Candidate]] = {}
+def switches(attached: Sequence[Candidate]) -> dict[str, list[Candidate]]:
+    """Return the effects on what runs along the model's signals, by the constant that skips them."""
+    return _by([c for c in attached if c.effect.kind not in ("parameter", "constant")], switch)
+
+
+def _by(attached: Sequence[Candidate], key: Callable[[Candidate], str]) -> dict[str, list[Candidate]]:
+    found: dict[str, list[Candidate]] = {}
     for candidate in attached:
-        if candidate.effect.kind not in ("parameter", "constant"):
-            at_signal.setdefault(candidate.signal, []).append(candidate)
-    return at_signal
+        found.setdefault(key(candidate), []).append(candidate)
+    return found
 
 
 def effects_of(model: Model) -> tuple[str, ...]:
@@ -113,15 +114,17 @@ def effects_of(model: Model) -> tuple[str, ...]:
 @functools.cache
 def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[str, ...], switched: bool) -> Equations:
     """Return the equations with effects, the same objects for the same effects."""
-    inputs = effects_at([c for c in attached if c.effect.kind == "input"])
+    inputs = _by([c for c in attached if c.effect.kind == "input"], lambda c: c.signal)
     given_wrong = tuple(c for c in attached if c.effect.kind == "constant")
     drifting = tuple(c for c in attached if c.effect.kind == "parameter")
     remembering = tuple(c for c in attached if c.effect.memory and c.effect.kind != "input")
-    sensing = {_slot(c) for c in remembering if c.signal in base.outputs}
+    sensors = [c for c in remembering if c.signal in base.outputs]
+    sensing = {_slot(c) for c in sensors}
     inside = {_slot(c) for c in remembering} - sensing
-    sensors = [name for name in base.outputs if any(c.signal == name for c in remembering)]
     names = (*base.inputs, *(disturbance(place) for place in places))
-    at_signal = effects_at([c for c in attached if c.effect.kind != "input"])
+    at_signal = _by(
+        [c for c in attached if c.effect.kind not in ("input", "parameter", "constant")], lambda c: c.signal
+    )
 
     def own_of(candidate, parameters):
         return {p.name: parameters[candidate.parameter(p.name)] for p in candidate.effect.parameters}
@@ -140,33 +143,31 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             context |= {"duration": parameters[DURATION], "time": moment.time, "step_size": moment.step_size}
             if name in base.outputs:
                 context |= {input_named(key): held for key, held in moment.values.items()}
-            effects = at_signal.get(name, ())
-            slots = {_slot(c): moment.memories[_slot(c)] for c in effects if c.effect.memory}
-
-            def behind_effects(value, memories):
-                following = dict(memories)
-                for candidate in effects:
-                    own = own_of(candidate, parameters)
-                    if candidate.effect.memory:
-                        slot = _slot(candidate)
-                        value, following[slot] = candidate.effect.apply(own, value, context, memories[slot])
-                    else:
-                        value = candidate.effect.apply(own, value, context)
-                return value, following
-
-            if effects:
-                value, following = where_on(parameters, [name], behind_effects, value, slots)
-                for slot, memory in following.items():
-                    moment.remember(slot, memory)
+            for candidate in at_signal.get(name, ()):
+                value = behind(candidate, parameters, value, context, moment)
             return value
 
         return disturbed
 
-    def where_on(parameters, names, function, *operands):
-        """Return what the function makes of the operands, or these themselves where no effect acts at the signals."""
+    def behind(candidate, parameters, value, context, moment):
+        """Return the value behind an effect, whose memory moves on; both as they are where the effect is skipped."""
+        apply, own = candidate.effect.apply, own_of(candidate, parameters)
+        if not candidate.effect.memory:
+            (value,) = where_on(parameters, [candidate], lambda value: (apply(own, value, context),), value)
+            return value
+        slot = _slot(candidate)
+        remembered = moment.memories[slot]
+        value, memory = where_on(
+            parameters, [candidate], lambda *both: apply(own, both[0], context, both[1]), value, remembered
+        )
+        moment.remember(slot, memory)
+        return value
+
+    def where_on(parameters, effects, function, *operands):
+        """Return what the function makes of the operands, or these themselves where none of the effects acts."""
         if not switched:
             return function(*operands)
-        acting = functools.reduce(operator.or_, [parameters[switch(name)] > 0.0 for name in names])
+        acting = functools.reduce(operator.or_, [parameters[name] > 0.0 for name in switches(effects)])
         typed = jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), operands, jax.eval_shape(function, *operands))
         return lax.cond(acting, function, lambda *operands: operands, *typed)
 
@@ -240,13 +241,9 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
         time = sample_period * jnp.stack([samples, samples + 0.5, samples + 1.0], axis=-1)
         context = {"duration": parameters[DURATION], "time": time, "sample_period": sample_period}
         for name, effects in inputs.items():
-
-            def behind_effects(course, effects=effects):
-                for c in effects:
-                    course = c.effect.apply(own_of(c, parameters), course, context)
-                return (course,)
-
-            (course,) = where_on(parameters, [name], behind_effects, changed.get(name, series[name]))
+            course = changed.get(name, series[name])
+            for candidate in effects:
+                course = behind(candidate, parameters, course, context, None)
             changed = changed | {name: course}
         return changed
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ehsvjax import arithmetic, kernels
 from ehsvjax.effects.effect import UNLIMITED, Candidate, EffectParameter, Scales, constant_of
-from ehsvjax.effects.extended import effects_at, switch
+from ehsvjax.effects.extended import switches
 from ehsvjax.effects.internal import Internal
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
@@ -205,8 +205,8 @@ class Workbench:
     def _sizes_at(self) -> dict[str, list[int]]:
         """Columns of the numbers that make effects vanish, by the switch that skips these effects."""
         return {
-            switch(signal): [j for c in some for number, j in self.unknowns_of(c) if number.absent is not None]
-            for signal, some in effects_at(self.candidates).items()
+            name: [j for c in some for number, j in self.unknowns_of(c) if number.absent is not None]
+            for name, some in switches(self.candidates).items()
         }
 
     @functools.cached_property
