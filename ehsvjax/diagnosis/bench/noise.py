@@ -269,18 +269,20 @@ def noise_outside(
     }
     # What was taken of the noise depends on the noise, first taken to be white. Of slow noise most lies inside the
     # space: each round finds a part of what the last one missed. What does not settle, round by round, is misfit
-    # outside the space that looks like ever slower noise; but a change of an autoregression's order may be of any size.
-    last = dict.fromkeys(channels, np.inf)
+    # outside the space that looks like ever slower noise; but a change of an autoregression's order may be of any size,
+    # and rounds may go to and fro between two orders: they end where one has been before.
+    last, before = dict.fromkeys(channels, np.inf), [noises]
     for count in range(_ROUNDS):
-        before, found = noises, _completed(_of(noises, measured), basis, left, taken)
+        found = _completed(_of(noises, measured), basis, left, taken)
         changes = {c: abs(found[c].variance - noises[c].variance) for c in channels}
         another = {c: len(found[c].coefficients) != len(noises[c].coefficients) for c in channels}
         followed = {c: another[c] or changes[c] <= _SETTLING * last[c] for c in channels}
         noises = {c: found[c] if followed[c] else noises[c] for c in channels}
         if count:  # the first was that from white noise to coloured
             last = {c: np.inf if another[c] else changes[c] if followed[c] else 0.0 for c in channels}
-        if all(_alike(noises[c], before[c]) for c in channels):
+        if all(any(_alike(noises[c], one[c]) for one in before) for c in channels):
             break
+        before.append(noises)
     return _of({c: _times(noise, float(deviation[c]) ** 2) for c, noise in noises.items()}, measured)
 
 
