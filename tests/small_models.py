@@ -62,6 +62,15 @@ def carriage_plant(push, period, *, stiffness=STIFFNESS, damping=DAMPING, mass=M
     return lsim(system, push, time, interp=straight)[1]
 
 
+def driven_plant(push, period, *, limit, lag) -> np.ndarray:
+    """Return the position [time], exactly, of a carriage whose drive ends at a force, and then lags: held pushes."""
+    system = (
+        [[-1.0 / lag, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0 / MASS, -STIFFNESS / MASS, -DAMPING / MASS]],
+        [[1.0 / lag], [0.0], [0.0]], [[0.0, 1.0, 0.0]], [[0.0]],
+    )  # fmt: skip
+    return lsim(system, np.clip(push, -limit, limit), np.arange(len(push)) * period, interp=False)[1]
+
+
 def modulated_plant(push, period, modulation, steps=40) -> np.ndarray:
     """Return the position [time] of a carriage whose push depends on where it is, by the trapezoidal rule."""
     h, x, v, found = period / steps, 0.0, 0.0, []

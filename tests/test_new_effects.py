@@ -19,6 +19,7 @@ from tests.small_models import (
     carriage,
     carriage_plant,
     damper,
+    driven_plant,
     hysteretic_plant,
     one_way_plant,
     record_of,
@@ -140,6 +141,17 @@ def test_a_force_that_acts_in_what_is_measured_alone_is_named():
     found = diagnosed(damper(), record_of(0.01, {"displacement": moved}, {"force": force}, {"force": 1.0}, 3))
     assert found.names == ("coulomb_friction",), str(found)
     assert found.extended.parameters["coulomb_friction.force"] == pytest.approx(30.0, rel=0.02)
+
+
+def test_a_drive_that_ends_and_then_lags_has_a_limit_and_a_lag_that_may_be_the_sensors():
+    # What follows the limit is linear: the record is the same whichever of the two lags.
+    push, limit, lag = held_levels(12, 20.0, 150, 10), 15.0, 0.06
+    position = driven_plant(push, PERIOD, limit=limit, lag=lag)
+    found = diagnosed(carriage(), record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 13))
+    assert "input_saturation" in found.names, str(found)
+    assert [{"input_lag", "sensor_lag"}] == [set(group.causes) for group in found.alternatives], str(found)
+    sizes = {size.number: size.value for cause in found.causes for size in cause.sizes}
+    assert sizes == {"limit": pytest.approx(limit, rel=0.02), "time_constant": pytest.approx(lag, rel=0.02)}
 
 
 # --- Forces ---

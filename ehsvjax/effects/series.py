@@ -157,6 +157,7 @@ def follow_with_play(own, value, context, memory):
 # To another course between the samples, one for all of it.
 _SHARE_OF_THE_WAY = amplitude("share", "", constant(1e-2), constant(-1.0), constant(2.0))
 
+# In this order: an amplifier has its dead zone and its limit before anything lags behind it.
 INPUT = (
     Effect(
         "input_gain",
@@ -199,14 +200,6 @@ INPUT = (
         settled_by="declare the input's hold (band-limited), or measure it at ten times the rate",
     ),
     Effect(
-        "input_lag",
-        "input",
-        (size("time_constant", "s", _half_sample, _tenth_of_duration),),
-        _lagged,
-        says="a first-order lag before the plant",
-        settled_by="a multisine of 5-40 Hz at two amplitudes: a lag attenuates, a delay does not",
-    ),
-    Effect(
         "input_dead_zone",
         "input",
         (width("half_width", "{value}", (0.01, 0.04, 0.12)),),
@@ -221,6 +214,14 @@ INPUT = (
         lambda own, u, context: jnp.clip(u, -own["limit"], own["limit"]),
         says="large inputs are cut off",
         settled_by="a staircase of levels up to the largest input",
+    ),
+    Effect(
+        "input_lag",
+        "input",
+        (size("time_constant", "s", _half_sample, _tenth_of_duration),),
+        _lagged,
+        says="a first-order lag before the plant",
+        settled_by="a multisine of 5-40 Hz at two amplitudes: a lag attenuates, a delay does not",
     ),
     Effect(
         "input_hysteresis",
