@@ -269,20 +269,20 @@ def noise_outside(
     }
     # What was taken of the noise depends on the noise, first taken to be white. Of slow noise most lies inside the
     # space: each round finds a part of what the last one missed. What does not settle, round by round, is misfit
-    # outside the space that looks like ever slower noise; but a change of an autoregression's order may be of any size,
-    # and rounds may go to and fro between two orders: they end where one has been before.
-    last, before = dict.fromkeys(channels, np.inf), [noises]
-    for count in range(_ROUNDS):
-        found = _completed(_of(noises, measured), basis, left, taken)
+    # outside the space that looks like ever slower noise. An autoregression's order only falls on the way: a change by
+    # which it does may be of any size.
+    noises = _completed(_of(noises, measured), basis, left, taken)
+    last = dict.fromkeys(channels, np.inf)
+    for _ in range(_ROUNDS):
+        before, orders = noises, {c: len(noise.coefficients) for c, noise in noises.items()}
+        found = _completed(_of(noises, measured), basis, left, taken, orders)
         changes = {c: abs(found[c].variance - noises[c].variance) for c in channels}
-        another = {c: len(found[c].coefficients) != len(noises[c].coefficients) for c in channels}
-        followed = {c: another[c] or changes[c] <= _SETTLING * last[c] for c in channels}
+        simpler = {c: len(found[c].coefficients) < orders[c] for c in channels}
+        followed = {c: simpler[c] or changes[c] <= _SETTLING * last[c] for c in channels}
         noises = {c: found[c] if followed[c] else noises[c] for c in channels}
-        if count:  # the first was that from white noise to coloured
-            last = {c: np.inf if another[c] else changes[c] if followed[c] else 0.0 for c in channels}
-        if all(any(_alike(noises[c], one[c]) for one in before) for c in channels):
+        last = {c: np.inf if simpler[c] else changes[c] if followed[c] else 0.0 for c in channels}
+        if all(_alike(noises[c], before[c]) for c in channels):
             break
-        before.append(noises)
     return _of({c: _times(noise, float(deviation[c]) ** 2) for c, noise in noises.items()}, measured)
 
 
@@ -303,8 +303,11 @@ def _completed(
     basis: Float[np.ndarray, "record signal time direction"],
     left: Float[np.ndarray, "record time signal"],
     taken: Mapping[tuple[int, int], float],
+    orders: Mapping[tuple[int, int], int] | None = None,
 ) -> dict[tuple[int, int], ResidualNoise]:
     """Return the noise of each channel in `taken`, from what is left of it and what was taken, as a noise tells it.
+
+    Each is an autoregression of its order at most.
 
     By generalised least squares and its covariance: a step of restricted maximum likelihood (Patterson & Thompson 1971,
     "Recovery of inter-block information when block sizes are unequal"; Dempster, Laird & Rubin 1977, "Maximum
@@ -321,7 +324,8 @@ def _completed(
     def completed(k, i):
         here, unsure = known[k : k + 1, :, i], basis[k, i] @ root
         unsure[~known[k, :, i]] = 0.0
-        return residual_noise(whole[k : k + 1, :, i], here, "auto", autocovariance(unsure[None], here), taken[k, i])
+        absorbed, highest = autocovariance(unsure[None], here), None if orders is None else orders[k, i]
+        return residual_noise(whole[k : k + 1, :, i], here, "auto", absorbed, taken[k, i], highest)
 
     return {(k, i): completed(k, i) for k, i in taken}
 
