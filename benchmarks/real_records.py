@@ -174,7 +174,7 @@ def valve() -> Rig:
         real_models.valve(max(float(one.time[-1]) for one in records)),
         records,
         others,
-        ("dead_zone", "saturation", "area_asymmetry", "constant_load", "input_lag", "input_saturation",
+        ("dead_zone", "saturation", "area_asymmetry", "area_ratio", "constant_load", "input_lag", "input_saturation",
          "input_dead_zone", "null_bias", "coulomb_friction", "natural_frequency"),
         ("dead_zone",),
         {

@@ -61,9 +61,10 @@ _ACTS_THROUGH: Mapping[str, str] = {
     "position": "hardening_spring end_stop sensor_saturation sensor_cubic sensor_gain sensor_quantisation "
     "sensor_asymmetry cubic_stiffness quintic_stiffness quadratic_stiffness damping_threshold asymmetric_damping "
     "elastic_friction",
-    "velocity": "coulomb_friction stribeck_friction viscous_friction area_asymmetry sensor_lag feedback_backlash "
-    "torque_motor_hysteresis transport_delay supply_droop structural_flexibility linear_damping rayleigh_damping "
-    "quadratic_damping asymmetric_damping damping_threshold input_lag one_way_damping elastic_friction",
+    "velocity": "coulomb_friction stribeck_friction viscous_friction area_asymmetry area_ratio sensor_lag "
+    "linear_damping feedback_backlash torque_motor_hysteresis transport_delay supply_droop structural_flexibility "
+    "rayleigh_damping quadratic_damping asymmetric_damping damping_threshold input_lag one_way_damping "
+    "elastic_friction",
     "command": "input_gain input_lag input_dead_zone input_saturation transport_delay",
     "spool": "null_bias asymmetric_dead_zone null_leakage flow_gain_rounding flow_gain_curvature spool_rate_limit "
     "torque_motor_hysteresis",
@@ -294,7 +295,7 @@ def _of_valve(fit, record) -> Discrepancy:
                                "spool_rate_limit"),
         "opening near its edge": (by_opening * side * np.exp(-np.abs(opening) / 1e-4), "flow_gain_rounding"),
         "inside the dead zone": (inside * (opening == 0.0), "null_leakage"),
-        "|flow|": (np.abs(flow), "area_asymmetry"),
+        "|flow|": (np.abs(flow), "area_asymmetry area_ratio"),
         "flow opening^2": (flow * opening**2, "flow_gain_curvature"),
         "flow t": (flow * t, "flow_gain_drift"),
         "pressure": (pressure, "cross_piston_leakage"),

@@ -44,6 +44,7 @@ SERVOVALVE_EFFECTS = {
     "hardening_spring": {"coefficient": (0.0, 5.6e5, 2.8e6)},
     "constant_load": {"force": (0.0, 100.0, 3000.0)},
     "area_asymmetry": {"asymmetry": (0.0, 0.05, 0.5)},
+    "area_ratio": {"ratio": (1.0, 0.5, 0.95)},
     "end_stop": {"position": (np.inf, 0.02, 0.04), "stiffness": (0.0, 1e7, 1e8)},
     "flow_gain_drift": {"drift": (0.0, 0.02, 0.1)},
     "flow_gain_rounding": {"width": (0.0, 1e-5, 1e-4)},
@@ -196,7 +197,11 @@ def servovalve_with(
         quantum = sizes["sensor_quantisation"][:, None]
         safe = np.where(quantum > 0, quantum, 1.0)
         position = np.where(quantum > 0, safe * np.round(position / safe), position)
-    return {"position": position, "spool": displacement.T, "load_pressure": pressure.T}
+    return {
+        "position": position,
+        "spool": displacement.T,
+        "load_pressure": _between_chambers(pressure, displacement, valve, sizes).T,
+    }
 
 
 def van_der_pol_with(
@@ -376,6 +381,8 @@ def _opening(spool, valve, sizes):
 def _conductance(opening, time, duration, valve, sizes):
     """Flow per root of pressure [batch], m^3/(s Pa^0.5), not negative."""
     conductance = valve.flow_gain * np.abs(opening)
+    if "area_ratio" in sizes:
+        conductance = conductance * np.sqrt(2.0 / (1.0 + sizes["area_ratio"] ** 3))
     if "flow_gain_drift" in sizes:
         conductance = conductance * (1.0 + sizes["flow_gain_drift"] * (time / duration))
     if "flow_gain_curvature" in sizes:
@@ -445,6 +452,9 @@ def _balanced(start, velocity, opening, conductance, time, step, valve, sizes):
     if "unknown_position_dependent_supply" in sizes:
         depth, place, width = sizes["unknown_position_dependent_supply"]
         supply = supply - valve.supply_pressure * depth * _gaussian(x, place, width)
+    if "area_ratio" in sizes:
+        # Backward the supply acts on the smaller area.
+        supply = supply * np.where(opening < 0, sizes["area_ratio"], 1.0)
     blocked = np.sign(opening) * supply  # load pressure without any flow
     mobility = step / valve.mass
     force, stiffness = _external_force(x, time, valve, sizes)
@@ -481,6 +491,19 @@ def _balanced(start, velocity, opening, conductance, time, step, valve, sizes):
     # A valve that closed during the step has stopped the load: what is left is the static balance.
     pressure = np.where(conductance + loss > 0, blocked - square, (stiffness * position + force) / area)
     return Load(position, velocity, pressure)
+
+
+def _between_chambers(pressure, spool, valve, sizes):
+    """Difference of the chambers' pressures, where the load's force over the larger area is a pressure.
+
+    Each chamber has half of the valve; the flows into the one and out of the other are as the areas are.
+    """
+    if "area_ratio" not in sizes:
+        return pressure
+    ratio, supply = sizes["area_ratio"], valve.supply_pressure
+    ahead = np.where(spool < 0, pressure + ratio * supply, pressure + ratio**3 * supply) / (1.0 + ratio**3)
+    behind = np.where(spool < 0, supply - ratio**2 * ahead, ratio**2 * (supply - ahead))
+    return ahead - behind
 
 
 def _sensed_position(position, fraction, sizes):

@@ -78,6 +78,50 @@ def servovalve_plant(command, sample_period, *, hold="zero", method="LSODA", rto
     return Motion(position, velocity, spool, np.array(pressures)[: len(command)])
 
 
+def two_chamber_plant(command, sample_period, ratio, *, bulk=14e8, volume=5e-5, friction=0.0):
+    """Simulate the paper's valve at a cylinder with one rod over a command [time]: position m, pA - pB Pa, each [time].
+
+    Each chamber has its own oil, of a volume that the piston changes, and its own two orifices; the load has viscous
+    friction. For equal areas H of the paper is that of two orifices in series: each has sqrt(2) of it.
+    """
+    v = Valve()
+    area, other, orifice = v.piston_area, ratio * v.piston_area, math.sqrt(2.0) * v.flow_gain
+
+    def through(opening, drop):
+        return orifice * opening * math.copysign(math.sqrt(abs(drop)), drop)
+
+    def equations(u):
+        def derivative(t, y):
+            x, speed, p, rate, ahead, behind = y
+            opening = p - min(max(p, -v.dead_zone), v.dead_zone)
+            opening = min(max(opening, -v.saturation), v.saturation)
+            filled = through(opening, v.supply_pressure - ahead if opening > 0.0 else ahead)
+            emptied = through(opening, behind if opening > 0.0 else v.supply_pressure - behind)
+            driven = v.natural_frequency**2 * (u - v.feedback_gain * x - p)
+            return [
+                speed,
+                (area * ahead - other * behind - v.stiffness * x - friction * speed) / v.mass,
+                rate,
+                driven - 2.0 * v.damping_ratio * v.natural_frequency * rate,
+                bulk / (volume + area * (0.2 + x)) * (filled - area * speed),
+                bulk / (volume + other * (0.2 - x)) * (other * speed - emptied),
+            ]
+
+        return derivative
+
+    # At rest, as the valve leaves them that has just closed from forward.
+    behind = v.supply_pressure * ratio**2 / (1.0 + ratio**3)
+    state = np.array([0.0, 0.0, 0.0, 0.0, ratio * behind, behind])
+    states = [state]
+    for first, last, u, _ in _straight_pieces(np.asarray(command, dtype=float), sample_period, "zero"):
+        times = np.arange(last - first + 1) * sample_period
+        piece = _integrated(equations(u), state, times, "LSODA", 1e-8, [1e-9, 1e-7, 1e-10, 1e-7, 1.0, 1.0])
+        state = piece[-1]
+        states.extend(piece[1:])
+    found = np.array(states)[: len(command)]
+    return found[:, 0], found[:, 4] - found[:, 5]
+
+
 def van_der_pol_plant(command, sample_period, alpha=0.96, gamma=1.23, initial=(0.0, 0.0)) -> np.ndarray:
     """Simulate equation (10) of the paper over a command [time] held between samples; x1 and x2, [time, 2]."""
     state = np.asarray(initial, dtype=float)

@@ -33,6 +33,7 @@ def servovalve(
     supply_pressure: float = 140e5,
     mass: float = 20.0,
     stiffness: float = 1e4,
+    area_ratio: float = 1.0,
     transfer_function: Placement = "valve",
     open_loop: bool = False,
     hydraulic_capacitance: float = 0.0,
@@ -50,7 +51,14 @@ def servovalve(
         Q   = A*x' + C*PL' + Ct*PL                continuity, equation (8); C = Ct = 0 in the paper
         A*PL = M*x'' + K*x                        load
 
-    Input `command`; outputs `position`, `spool` and `load_pressure`, any of which a record may hold. Identified unless
+    The two areas of a piston with one rod are A and r*A: PL is then the load's force over A, and the orifices give
+    (the flow through the two being in the ratio of the areas; Merritt 1967, "Hydraulic control systems", has r = 1)
+
+        Q   = H*xv*sqrt(2/(1 + r^3))*sqrt(s*Ps - sgn(xv)*PL),    s = 1 forward, r backward
+        pA - pB = ((1 + r^2)*PL - (1 - r)*c*Ps)/(1 + r^3),       c = r^2 forward, 1 backward
+
+    Input `command`; outputs `position`, `spool` and `load_pressure`, the difference pA - pB of the chambers' pressures;
+    a record may hold any of them. Identified unless
     fixed: dead_zone d, saturation S, flow_gain H = Cd*w/sqrt(rho), feedback_gain Gc, damping_ratio xi,
     natural_frequency w; bounds are +-50% of the paper's values (H: of 1.45e-4, since the printed 1e-5 is a misprint,
     as the identified values in the paper's table 2 show). The constants are parameters too, fixed by default:
@@ -61,6 +69,7 @@ def servovalve(
         supply_pressure: Ps, Pa.
         mass: M, kg.
         stiffness: K, N/m.
+        area_ratio: r, of the area on the rod's side, which draws back, and that of the other; 1 for equal areas.
         transfer_function: where the second-order transfer function sits, which the paper leaves open:
             "valve": on the spool, p = W(s)*(u - Gc*x); the only reading in which the position fixes all six parameters;
             "forward": the controller in the forward path, p = Gc*W(s)*(u - x), u in metres of position; only H*Gc,
@@ -89,6 +98,7 @@ def servovalve(
         Parameter("supply_pressure", "Ps", "Pa", supply_pressure, 1e5, 1e8, "log", fixed=True),
         Parameter("mass", "M", "kg", mass, 1e-2, 1e5, "log", fixed=True),
         Parameter("stiffness", "K", "N/m", stiffness, 0.0, 1e9, fixed=True),
+        Parameter("area_ratio", "r", "", area_ratio, 0.2, 5.0, "log", fixed=True),
         Parameter("hydraulic_capacitance", "C", "m^3/Pa", hydraulic_capacitance, 0.0, 1e-9, fixed=True),
         Parameter("leakage_coefficient", "Ct", "m^3/(s Pa)", leakage_coefficient, 0.0, 1e-9, fixed=True),
     )
@@ -214,7 +224,8 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
         opening = opening_of(parameters, spool_of(parameters, command, filtered, identity), identity)
         per_area = 1.0 / parameters["piston_area"]
         load_pressure = parameters["stiffness"] * per_area * position
-        flow = hydraulics.load_flow(parameters["flow_gain"], opening, parameters["supply_pressure"], load_pressure)
+        supply = _supply_towards(parameters, opening, parameters["supply_pressure"])
+        flow = hydraulics.load_flow(_flow_gain(parameters), opening, supply, load_pressure)
         return ServovalveState(
             position=position,
             velocity=flow * per_area,
@@ -286,7 +297,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
         return {
             "position": signal("position", state.position, velocity=state.velocity, load_force=load_force),
             "spool": signal("spool", spool),
-            "load_pressure": signal("load_pressure", state.load_pressure),
+            "load_pressure": signal("load_pressure", _difference_of_chambers(parameters, spool, state.load_pressure)),
         }
 
     return _Equations(start, stepper, measure)
@@ -298,9 +309,9 @@ def _load_stage(parameters, h, signal):
     The stage solves, for the opening xv given,
         x1 = x0 + h*v1
         M*(v1 - v0)/h + K*x1 + F = A*PL1
-        H*xv*r = A*v1 + Ct*PL1 + C*(PL1 - PL0)/h,   PL1 = s*(Ps - r*|r|),   s = sgn(xv).
+        H*xv*q = A*v1 + Ct*PL1 + C*(PL1 - PL0)/h,   PL1 = s*(Ps - q*|q|),   s = sgn(xv).
     The load is linear, so that its flow is a straight line of the pressure, and what remains is a quadratic for the
-    signed root r of the pressure drop. Its closed form never divides by xv: at xv = 0 (hydraulic lock) it gives Q = 0.
+    signed root q of the pressure drop. Its closed form never divides by xv: at xv = 0 (hydraulic lock) it gives Q = 0.
 
     Dry friction R adds R*sgn(v1) to F. As v1 falls with F, the piston moves forward if it does so against F + R,
     backward if it does so against F - R, and sticks otherwise: no chatter.
@@ -328,9 +339,27 @@ def _load_stage(parameters, h, signal):
     return stage
 
 
+def _flow_gain(parameters):
+    """Return the flow gain of the two orifices in series, equal for equal areas."""
+    return parameters["flow_gain"] * jnp.sqrt(2.0 / (1.0 + parameters["area_ratio"] ** 3))
+
+
+def _supply_towards(parameters, opening, supply):
+    """Return the pressure that drives the piston where the valve opens to: backward it acts on the other area."""
+    return jnp.where(opening < 0.0, parameters["area_ratio"] * supply, supply)
+
+
+def _difference_of_chambers(parameters, spool, load_pressure):
+    """Return pA - pB, of the chambers as the valve last filled them."""
+    ratio = parameters["area_ratio"]
+    by_supply = jnp.where(spool < 0.0, 1.0 - ratio, (1.0 - ratio) * ratio**2) * parameters["supply_pressure"]
+    return ((1.0 + ratio**2) * load_pressure - by_supply) / (1.0 + ratio**3)
+
+
 class _LoadCoefficients(NamedTuple):
     """What of a stage does not change from step to step, for one piston area: a reciprocal serves every step."""
 
+    flow_gain: Any
     flow_by_momentum: Any
     pressure_by_flow: Any
     half_slope_by_opening: Any
@@ -344,23 +373,24 @@ def _load_coefficients(parameters, area, h, signal):
     leakage = signal("leakage_coefficient", parameters["leakage_coefficient"])
     flow_by_momentum = area / (parameters["mass"] + h * h * parameters["stiffness"])
     pressure_by_flow = 1.0 / (h * area * flow_by_momentum + leakage + storage)
-    half_slope_by_opening = 0.5 * parameters["flow_gain"] * pressure_by_flow
-    return _LoadCoefficients(flow_by_momentum, pressure_by_flow, half_slope_by_opening, 1.0 / area, storage, leakage)
+    flow_gain = _flow_gain(parameters)
+    half_slope = 0.5 * flow_gain * pressure_by_flow
+    return _LoadCoefficients(flow_gain, flow_by_momentum, pressure_by_flow, half_slope, 1.0 / area, storage, leakage)
 
 
 def _motion(parameters, coefficients, h, position, velocity, pressure, opening, supply, force):
     """Return position, velocity and pressure at the end of a stage without dry friction."""
-    flow_by_momentum, pressure_by_flow, half_slope_by_opening, per_area, storage, leakage = coefficients
+    flow_gain, flow_by_momentum, pressure_by_flow, half_slope_by_opening, per_area, storage, leakage = coefficients
     momentum = parameters["mass"] * velocity - h * (parameters["stiffness"] * position + force)
     flow_at_rest = flow_by_momentum * momentum - storage * pressure
     direction = jnp.where(opening < 0.0, -1.0, 1.0)
     half_slope = half_slope_by_opening * jnp.abs(opening)
-    drop = supply + direction * flow_at_rest * pressure_by_flow
+    drop = _supply_towards(parameters, opening, supply) + direction * flow_at_rest * pressure_by_flow
     square = half_slope * half_slope + jnp.abs(drop)
     # Closed, and just balanced by the load: no flow, and no derivative of a root of zero.
     flowing = square > 0.0
     root = jnp.where(flowing, drop / (half_slope + jnp.sqrt(jnp.where(flowing, square, 1.0))), 0.0)
-    flow = parameters["flow_gain"] * opening * root
+    flow = flow_gain * opening * root
     pressure_end = (flow - flow_at_rest) * pressure_by_flow
     velocity_end = (flow - leakage * pressure_end - storage * (pressure_end - pressure)) * per_area
     return position + h * velocity_end, velocity_end, pressure_end
@@ -369,5 +399,5 @@ def _motion(parameters, coefficients, h, position, velocity, pressure, opening, 
 def _flow_force_stroke(parameters, opening, supply, load_pressure):
     """Stroke by which the steady flow force, equation (6), holds the spool back, m; two orifices share the drop."""
     area_gradient = parameters["flow_gain"] * jnp.sqrt(parameters["oil_density"]) / hydraulics.DISCHARGE_COEFFICIENT
-    drop = supply - jnp.where(opening < 0.0, -1.0, 1.0) * load_pressure
+    drop = _supply_towards(parameters, opening, supply) - jnp.where(opening < 0.0, -1.0, 1.0) * load_pressure
     return hydraulics.flow_force_stiffness(area_gradient, drop) * opening / parameters["spool_stiffness"]

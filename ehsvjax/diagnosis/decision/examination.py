@@ -33,8 +33,9 @@ class Examination(NamedTuple):
         chance: the random force that explains what the causes leave; None if none does.
         chance_behind: of each cause, noise variances by which a random force in its place, or in that of all, is
             behind, less what chance would gain with what it stands for; infinite where none is about as likely.
-        instead: one term of free form that explains the record as well as all causes together, but for the price of
-            its pieces; looked for beside several, or where they leave something; None if none does.
+        left: a term of free form in what the causes leave; None where that is nothing, or chance.
+        instead: one term of free form that explains the record as well as all causes together and what they leave, but
+            for the price of its pieces; looked for beside several, or where they leave something; None if none does.
         lacking: whether that term explains more, its price paid: the bank lacks what is missing.
 
     """
@@ -46,6 +47,7 @@ class Examination(NamedTuple):
     undecided: bool
     chance: ProcessNoise | None
     chance_behind: tuple[float, ...]
+    left: MissingTerm | None
     instead: MissingTerm | None
     lacking: bool
 
@@ -86,22 +88,19 @@ def examine(selection: Selection) -> Examination:
     elif innocent:
         # Then all of it tells of the noise, and more than what lies outside all responses.
         selection = replace(selection, noise=noise_of_all_left(bench, selection.final))
-    instead, lacking = _instead(selection, before, innocent and chance is None)
+    left = None
+    if not innocent:
+        left, _ = missing_term(bench, selection.final, selection.noise, selection.seen, _suspects(after))
+    instead, lacking = _instead(selection, before, innocent and chance is None, left)
     if lacking and chance is not None:
         innocent = False
     still_open = undecided and repeated is None
-    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, instead, lacking)
+    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, left, instead, lacking)
 
 
 def remaining_term(examined: Examination) -> MissingTerm | None:
     """Return what is missing beside the causes that were found, or could be in the place of them all."""
-    if examined.innocent or examined.lacking:
-        return examined.instead
-    selection = examined.selection
-    term, _ = missing_term(
-        selection.bench, selection.final, selection.noise, selection.seen, _suspects(examined.after)
-    )  # fmt: skip
-    return term
+    return examined.instead if examined.innocent or examined.lacking else examined.left
 
 
 def _significant(tests: tuple[Dependence, ...]) -> bool:
@@ -172,20 +171,24 @@ def _chance_in(
     return force._replace(settled=repeated is False)
 
 
-def _instead(selection: Selection, before: tuple[Dependence, ...], innocent: bool) -> tuple[MissingTerm | None, bool]:
+def _instead(
+    selection: Selection, before: tuple[Dependence, ...], innocent: bool, left: MissingTerm | None
+) -> tuple[MissingTerm | None, bool]:
     """Return a term of free form that explains the record as well as all causes together, and whether better.
 
-    It is not better if the causes predict the unused data of any record better: what follows any data that it is
-    refitted to must at least predict. What depends on time alone does not: no other record would have it. It is better
-    than causes of which one is of this run alone too: it is the general form of those.
+    What the causes leave is explained by a term of free form too: one that follows anything is always better than
+    causes that leave something. It is not better if the causes predict the unused data of any record better: what
+    follows any data that it is refitted to must at least predict. What depends on time alone does not: no other record
+    would have it. It is better than causes of which one is of this run alone too: it is the general form of those.
     """
     causes = selection.included
     if not before or not causes or (innocent and len(causes) == 1):
         return None, False
     bench, noise, nominal = selection.bench, selection.noise, selection.nominal
     term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
-    better = noise.gained(selection.final.residual[0], term.residual)
-    better += sum(_price(selection, i) for i in causes)
+    beside = selection.final.residual[0] if left is None else left.residual
+    better = noise.gained(beside, term.residual)
+    better += sum(_price(selection, i) for i in causes) + (0.0 if left is None else _bayes_price(noise, left.pieces))
     of_run = any(bench.candidates[i].effect.of_run for i in causes)
     if (term.quantity == TIME and not of_run) or not better > _bayes_price(noise, term.pieces) + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
