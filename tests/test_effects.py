@@ -109,7 +109,8 @@ def test_every_effect_is_what_an_independent_plant_has(make, plant, period, comm
     for (name, sizes), truth in zip(hidden.items(), shown, strict=True):
         values = dict(absent)
         for number, value in in_the_package(name, sizes).items():
-            (found,) = [n for n in (f"{name}{at}.{number}" for at in ("", "@position", "@gamma")) if n in values]
+            possible = (name, *(f"{name}{at}.{number}" for at in ("", "@position", "@gamma")))
+            (found,) = {p.name for p in extended.parameters} & set(possible)
             values[found] = value
         simulated = ehsvjax.simulate(extended, record, values)["position"]
         effect, error = np.abs(truth - plain).max(), np.abs(simulated - truth).max()
