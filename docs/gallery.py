@@ -126,6 +126,7 @@ SIZES: dict[str, dict[str, float]] = {
     "supply_pulsation": {"cosine": 0.0, "sine": 1e6, "frequency": 60.0},
     "return_pressure": {"pressure": 1e6},
     "area_asymmetry": {"asymmetry": 0.2},
+    "area_ratio": {"error": -0.3},
     "cross_piston_leakage": {"coefficient": 2e-11},
     "oil_compressibility": {"capacitance": 3e-12},
     "constant_load": {"force": 3e3},
@@ -176,8 +177,8 @@ wrong, and an input that a sensor shows at once.
 KINDS = {
     "input": "At an input", "drive": "At the drive of the torque motor", "feedback": "At the feedback",
     "spool": "At the spool", "rate": "At the rate of the spool", "opening": "At the opening of the orifices",
-    "supply": "At the supply pressure", "area": "At the piston's area", "leakage": "At the leakage",
-    "capacitance": "At the hydraulic capacitance", "load": "At a load, which resists",
+    "supply": "At the supply pressure", "area": "At the piston's area", "area_ratio": "At the ratio of its areas",
+    "leakage": "At the leakage", "capacitance": "At the hydraulic capacitance", "load": "At a load, which resists",
     "friction": "At a friction, the size of a force against the velocity", "force": "At a force, which drives",
     "damping": "At the oscillator's damping", "displacement": "At a displacement, any other length",
     "storage": "At what is stored", "parameter": "At a parameter, as time passes", "sensor": "At a sensor",

@@ -1,5 +1,7 @@
 """Effects of a servovalve and its actuator, and of the Van der Pol oscillator's damping."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -160,6 +162,14 @@ VALVE = (
         lambda own, area, context: area * (1.0 - own["asymmetry"]),
         says="the piston's area is smaller on its way back",
         settled_by="half the supply pressure",
+    ),
+    Effect(
+        "area_ratio",
+        "area_ratio",
+        (relative_error(usual=math.inf),),
+        off_by_error,
+        says="the piston has a rod on one side, or one that is larger than was given: its two areas differ",
+        settled_by="measure the rod, and say so: servovalve(area_ratio=...); or the pressures of both chambers",
     ),
     Effect(
         "cross_piston_leakage",

@@ -68,7 +68,7 @@ class Parameter(NamedTuple):
 
 KINDS = (
     "input", "sensor", "force", "load", "friction", "storage", "displacement", "damping",
-    "feedback", "drive", "spool", "rate", "opening", "supply", "area", "leakage", "capacitance",
+    "feedback", "drive", "spool", "rate", "opening", "supply", "area", "area_ratio", "leakage", "capacitance",
 )  # fmt: skip
 """Kinds of signals at which effects of this package can act."""
 

@@ -98,7 +98,7 @@ def servovalve(
         Parameter("supply_pressure", "Ps", "Pa", supply_pressure, 1e5, 1e8, "log", fixed=True),
         Parameter("mass", "M", "kg", mass, 1e-2, 1e5, "log", fixed=True),
         Parameter("stiffness", "K", "N/m", stiffness, 0.0, 1e9, fixed=True),
-        Parameter("area_ratio", "r", "", area_ratio, 0.2, 5.0, "log", fixed=True),
+        Parameter("area_ratio", "r", "", area_ratio, 0.2, 5.0, "log", fixed=True, certain=True),
         Parameter("hydraulic_capacitance", "C", "m^3/Pa", hydraulic_capacitance, 0.0, 1e-9, fixed=True),
         Parameter("leakage_coefficient", "Ct", "m^3/(s Pa)", leakage_coefficient, 0.0, 1e-9, fixed=True),
     )
@@ -137,6 +137,7 @@ def servovalve(
             Signal("load_force", "load", "N"),
             Signal("load_friction", "friction", "N"),
             Signal("retraction_area", "area", "m^2"),
+            Signal("area_ratio", "area_ratio", ""),
             Signal("leakage_coefficient", "leakage", "m^3/(s Pa)"),
             Signal("hydraulic_capacitance", "capacitance", "m^3/Pa"),
             Signal("position", "sensor", "m"),
@@ -236,6 +237,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
 
     def stepper(parameters, step_size, signal):
         """Return one step: the transfer function exactly, for an input drawn as a straight line; the load by SDIRK."""
+        parameters = _with_rod(parameters, signal)
         stage_size = SDIRK_GAMMA * step_size
         per_stage_size, per_step_size = 1.0 / stage_size, 1.0 / step_size
         to_stage, to_end = (
@@ -292,6 +294,7 @@ def _equations(transfer_function: Placement, open_loop: bool, flow_force: bool) 
         return step
 
     def measure(parameters, state, inputs, signal):
+        parameters = _with_rod(parameters, signal)
         spool = spool_of(parameters, signal("command", inputs["command"]), state.filtered, signal)
         load_force = parameters["piston_area"] * state.load_pressure
         return {
@@ -337,6 +340,11 @@ def _load_stage(parameters, h, signal):
         )
 
     return stage
+
+
+def _with_rod(parameters, signal):
+    """Return the parameters with the ratio of the areas behind the effects on it."""
+    return {**parameters, "area_ratio": signal("area_ratio", parameters["area_ratio"])}
 
 
 def _flow_gain(parameters):
