@@ -12,7 +12,7 @@ from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.progress import bar as progress_bar
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
-from ehsvjax.diagnosis.decision.examination import Examination, examine, remaining_term
+from ehsvjax.diagnosis.decision.examination import Examination, examine
 from ehsvjax.diagnosis.decision.search import select
 from ehsvjax.diagnosis.decision.verdict import verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
@@ -117,7 +117,7 @@ def _diagnosed(
         unseen=unseen_by(selection, suspected),
         innocent=examined.innocent,
         undecided=examined.undecided,
-        missing=remaining_term(examined),
+        missing=examined.missing,
         process_noise=examined.chance,
         integration=selection.integration,
         fit=fit,

@@ -57,12 +57,11 @@ def servovalve(
         Q   = H*xv*sqrt(2/(1 + r^3))*sqrt(s*Ps - sgn(xv)*PL),    s = 1 forward, r backward
         pA - pB = ((1 + r^2)*PL - (1 - r)*c*Ps)/(1 + r^3),       c = r^2 forward, 1 backward
 
-    Input `command`; outputs `position`, `spool` and `load_pressure`, the difference pA - pB of the chambers' pressures;
-    a record may hold any of them. Identified unless
-    fixed: dead_zone d, saturation S, flow_gain H = Cd*w/sqrt(rho), feedback_gain Gc, damping_ratio xi,
-    natural_frequency w; bounds are +-50% of the paper's values (H: of 1.45e-4, since the printed 1e-5 is a misprint,
-    as the identified values in the paper's table 2 show). The constants are parameters too, fixed by default:
-    give bounds to one and it is identified.
+    Input `command`; outputs `position`, `spool` and `load_pressure`, the difference pA - pB of the chambers' pressures,
+    any of which a record may hold. Identified unless fixed: dead_zone d, saturation S, flow_gain H = Cd*w/sqrt(rho),
+    feedback_gain Gc, damping_ratio xi, natural_frequency w; bounds are +-50% of the paper's values (H: of 1.45e-4, as
+    the printed 1e-5 is a misprint, which the identified values in the paper's table 2 show). The constants are
+    parameters too, fixed by default: give bounds to one and it is identified.
 
     Args:
         piston_area: A, m^2.
@@ -348,7 +347,7 @@ def _with_rod(parameters, signal):
 
 
 def _flow_gain(parameters):
-    """Return the flow gain of the two orifices in series, equal for equal areas."""
+    """Return the flow gain of the two orifices in series, by the areas; for equal ones it is H."""
     return parameters["flow_gain"] * jnp.sqrt(2.0 / (1.0 + parameters["area_ratio"] ** 3))
 
 

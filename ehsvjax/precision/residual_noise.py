@@ -61,7 +61,7 @@ def residual_noise(
         colour: "white", "coloured" or "auto".
         absorbed: what the fit took of the autocovariance, see `absorbed_by_the_fit`; None for nothing.
         taken: samples' worth of it that the fit took: what is left says as much less of the autocovariance.
-        highest: order of the autoregression, zero for white noise; None for any that the record can tell.
+        highest: the order of the autoregression at most, zero for white noise; None for any that the record can tell.
 
     """
     count = int(measured.sum())
@@ -73,8 +73,8 @@ def residual_noise(
     white = ResidualNoise(p_value, np.zeros(0), float(covariance[0]), float(covariance[0]))
     if colour == "white" or covariance[0] == 0 or (colour == "auto" and not p_value < SUSPICION):
         return white
-    highest = len(covariance) - 1 if highest is None else min(highest, len(covariance) - 1)
-    coefficients, innovation_variance = _autoregression(covariance[: highest + 1], count)
+    lags = None if highest is None else highest + 1
+    coefficients, innovation_variance = _autoregression(covariance[:lags], count)
     return white._replace(coefficients=coefficients, innovation_variance=innovation_variance)
 
 

@@ -307,7 +307,7 @@ def _completed(
 ) -> dict[tuple[int, int], ResidualNoise]:
     """Return the noise of each channel in `taken`, from what is left of it and what was taken, as a noise tells it.
 
-    Each is an autoregression of its order at most.
+    Each is an autoregression of its order in `orders` at most; of any without them.
 
     By generalised least squares and its covariance: a step of restricted maximum likelihood (Patterson & Thompson 1971,
     "Recovery of inter-block information when block sizes are unequal"; Dempster, Laird & Rubin 1977, "Maximum

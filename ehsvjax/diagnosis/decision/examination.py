@@ -51,6 +51,11 @@ class Examination(NamedTuple):
     instead: MissingTerm | None
     lacking: bool
 
+    @property
+    def missing(self) -> MissingTerm | None:
+        """What is missing beside the causes that were found, or could be in the place of them all."""
+        return self.instead if self.innocent or self.lacking else self.left
+
 
 def examine(selection: Selection) -> Examination:
     """Test what a selection leaves, and whether something else explains the record better."""
@@ -96,11 +101,6 @@ def examine(selection: Selection) -> Examination:
         innocent = False
     still_open = undecided and repeated is None
     return Examination(selection, before, after, innocent, still_open, chance, chance_behind, left, instead, lacking)
-
-
-def remaining_term(examined: Examination) -> MissingTerm | None:
-    """Return what is missing beside the causes that were found, or could be in the place of them all."""
-    return examined.instead if examined.innocent or examined.lacking else examined.left
 
 
 def _significant(tests: tuple[Dependence, ...]) -> bool:
