@@ -44,6 +44,16 @@ def test_dry_friction_comes_before_the_gap_and_another_amplitude_is_predicted():
 
 
 @pytest.mark.thorough
+def test_causes_are_not_priced_for_a_term_in_what_they_leave_that_is_not_worth_its_own_price():
+    """Of the drive, a curve of some seventy pieces gains little beside its causes, and as little in their place."""
+    rig, found = diagnosed("drive")
+    assert judged(rig, found).startswith("right"), str(found)
+    assert found.names[0] == "coulomb_friction"
+    (other,) = rig.others
+    assert found.extended.score(other).rmse["motor_force"] < 5.0 < found.fit.score(other).rmse["motor_force"]
+
+
+@pytest.mark.thorough
 def test_slow_misfit_is_not_taken_for_noise():
     """Of the tanks' other record alone, what is left is ten times the noise that is seen elsewhere."""
     rig = RIGS["tanks"]()

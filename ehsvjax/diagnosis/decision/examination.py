@@ -176,8 +176,8 @@ def _instead(
 ) -> tuple[MissingTerm | None, bool]:
     """Return a term of free form that explains the record as well as all causes together, and whether better.
 
-    What the causes leave is explained by a term of free form too: one that follows anything is always better than
-    causes that leave something. It is not better if the causes predict the unused data of any record better: what
+    What the causes leave may have a term of free form too: one that follows anything is always better than causes that
+    leave something. It is not better if the causes predict the unused data of any record better: what
     follows any data that it is refitted to must at least predict. What depends on time alone does not: no other record
     would have it. It is better than causes of which one is of this run alone too: it is the general form of those.
     """
@@ -186,9 +186,10 @@ def _instead(
         return None, False
     bench, noise, nominal = selection.bench, selection.noise, selection.nominal
     term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
-    beside = selection.final.residual[0] if left is None else left.residual
-    better = noise.gained(beside, term.residual)
-    better += sum(_price(selection, i) for i in causes) + (0.0 if left is None else _bayes_price(noise, left.pieces))
+    # What they leave has a term of its own where that earns its price.
+    beside = [(selection.final.residual[0], 0.0), *([] if left is None else [(left.residual, left.pieces)])]
+    better = min(noise.gained(residual, term.residual) + _bayes_price(noise, pieces) for residual, pieces in beside)
+    better += sum(_price(selection, i) for i in causes)
     of_run = any(bench.candidates[i].effect.of_run for i in causes)
     if (term.quantity == TIME and not of_run) or not better > _bayes_price(noise, term.pieces) + INSEPARABLE:
         return (term if better > -INSEPARABLE else None), False
