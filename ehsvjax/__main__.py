@@ -13,11 +13,11 @@ import numpy as np
 
 from ehsvjax import effects, excitation, paper
 from ehsvjax.diagnosis import diagnose
+from ehsvjax.drawing import to_png
 from ehsvjax.experiment import Limits
 from ehsvjax.identify import identify
 from ehsvjax.models import servovalve, van_der_pol
 from ehsvjax.paper import Identification
-from ehsvjax.plots import to_png
 from ehsvjax.record import Record
 from ehsvjax.report import write_report
 from ehsvjax.simulate import simulate

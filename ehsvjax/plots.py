@@ -1,8 +1,5 @@
 """Results as pictures: each function returns a matplotlib figure, which no global state of pyplot knows about."""
 
-import base64
-import functools
-import io
 import itertools
 import math
 from collections.abc import Mapping, Sequence
@@ -13,6 +10,21 @@ from jaxtyping import Float
 
 from ehsvjax.checks import instance
 from ehsvjax.correlations import Correlation, with_input, with_itself
+from ehsvjax.drawing import (
+    AXIS,
+    COMMAND,
+    MEASURED,
+    MODEL,
+    TRUE,
+    empty_figure,
+    house_style,
+    legend_above,
+    plain_text,
+    scale_and_unit,
+    scale_to_order_of_one,
+    share_time,
+    spaced,
+)
 from ehsvjax.fit import Fit
 from ehsvjax.hydraulics import normalised_pressure_flow_curves
 from ehsvjax.linear import LinearModel
@@ -26,26 +38,6 @@ if TYPE_CHECKING:
     import matplotlib.figure
 
     from ehsvjax.precision import Band, ProfileLikelihood
-
-_MEASURED, _MODEL, _TRUE, _COMMAND, _AXIS = "#9aa5b1", "#c2410c", "#1f2933", "#2563a8", "#616e7c"
-
-_STYLE = {
-    "font.size": 10,
-    "axes.labelsize": 10,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.edgecolor": _AXIS,
-    "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.xmargin": 0.01,
-    "grid.color": "#e4e7eb",
-    "grid.linewidth": 0.8,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "lines.linewidth": 1.4,
-}
 
 # Samples by which residuals are compared with themselves and with inputs.
 _LAGS = 25
@@ -71,21 +63,21 @@ def plot_fit(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
     simulated, score = fit.simulate(record, initial), fit.score(record, initial)
     bands = fit.bands(record, initial)
     count = len(record.outputs)
-    with _style():
+    with house_style():
         searched = len(fit.history.best_cost) > 0  # a fit that a diagnosis extended was not
-        figure = _figure(width=9.0, height=3.4 * count + 2.2 * searched)
-        figure.suptitle(_plain(f"{fit.model.name}: {record.name}"), x=0.01, ha="left", fontweight="bold")
+        figure = empty_figure(width=9.0, height=3.4 * count + 2.2 * searched)
+        figure.suptitle(plain_text(f"{fit.model.name}: {record.name}"), x=0.01, ha="left", fontweight="bold")
         rows = figure.subplots(2 * count + searched, 1, height_ratios=[2.2, 1.2] * count + [2.2] * searched)
         signals = rows[: 2 * count]
         for i, (name, measured) in enumerate(record.outputs.items()):
             unit = fit.model.unit(name)
             axes, below = signals[2 * i : 2 * i + 2]
             axes.set_title(
-                _plain(f"fit {percent_of_fit(score.fit_percent[name])}, rmse {quantity(score.rmse[name], unit)}")
+                plain_text(f"fit {percent_of_fit(score.fit_percent[name])}, rmse {quantity(score.rmse[name], unit)}")
             )
             _draw_series(axes, record.time, {"measured": measured, "model": simulated[name]}, name, unit)
             _draw_residual(below, record.time, measured - simulated[name], unit, bands.get(name))
-        _share_time(signals, record)
+        share_time(signals, record)
         if searched:
             _draw_search(rows[-1], fit)
         figure.align_ylabels()
@@ -118,27 +110,27 @@ def plot_residuals(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
             f"the simulation of {', '.join(failed)} is not finite on {record.name}: nothing is left to draw"
         )
     lags = min(_LAGS, len(record) // 4)
-    with _style():
-        figure = _figure(width=2.9 * (3 + len(record.inputs)), height=0.5 + 2.6 * len(left))
+    with house_style():
+        figure = empty_figure(width=2.9 * (3 + len(record.inputs)), height=0.5 + 2.6 * len(left))
         figure.suptitle(
-            _plain(f"{fit.model.name}: what is left of {record.name}"), x=0.01, ha="left", fontweight="bold"
+            plain_text(f"{fit.model.name}: what is left of {record.name}"), x=0.01, ha="left", fontweight="bold"
         )
         rows = figure.subplots(len(left), 3 + len(record.inputs), squeeze=False)
         for axes, (name, residual) in zip(rows, left.items(), strict=True):
-            factor, label = _scaled(residual, fit.model.unit(name))
+            factor, label = scale_and_unit(residual, fit.model.unit(name))
             _draw_correlation(axes[0], with_itself(residual, lags), "with itself")
-            axes[0].set_ylabel(f"{_words(name)}\ncorrelation")
+            axes[0].set_ylabel(f"{spaced(name)}\ncorrelation")
             for below, (driving, values) in zip(axes[1:], record.inputs.items(), strict=False):
-                _draw_correlation(below, with_input(residual, values, lags), f"with {_words(driving)}")
+                _draw_correlation(below, with_input(residual, values, lags), f"with {spaced(driving)}")
             there = residual[np.isfinite(residual)] / factor
-            axes[-2].hist(there, bins="auto", density=True, color=_MEASURED)
+            axes[-2].hist(there, bins="auto", density=True, color=MEASURED)
             places = np.linspace(there.min(), there.max(), 200)
-            axes[-2].plot(places, norm.pdf(places, there.mean(), there.std() or 1.0), color=_MODEL)
+            axes[-2].plot(places, norm.pdf(places, there.mean(), there.std() or 1.0), color=MODEL)
             axes[-2].set(title="its values", xlabel=f"residual {label}", yticks=[])
             filled = np.nan_to_num(residual - np.nanmean(residual)) / factor
             frequencies, power = welch(filled, 1.0 / record.sample_period, nperseg=min(len(filled), 512))
-            axes[-1].loglog(frequencies[1:], power[1:], color=_MEASURED)
-            axes[-1].axhline(2.0 * record.sample_period * float(np.mean(filled**2)), color=_MODEL, ls=(0, (4, 3)))
+            axes[-1].loglog(frequencies[1:], power[1:], color=MEASURED)
+            axes[-1].axhline(2.0 * record.sample_period * float(np.mean(filled**2)), color=MODEL, ls=(0, (4, 3)))
             axes[-1].set(title="its power, and that of white noise", xlabel="frequency (Hz)")
     return figure
 
@@ -146,20 +138,20 @@ def plot_residuals(fit: Fit, record: Record) -> "matplotlib.figure.Figure":
 def plot_comparison(fits: Mapping[str, Fit], records: Sequence[Record]) -> "matplotlib.figure.Figure":
     """Draw the outputs of records, measured and as several fits simulate them, a row for each record and output."""
     pairs = [(record, output) for record in records for output in record.outputs]
-    with _style():
-        figure = _figure(width=9.0, height=0.4 + 2.6 * len(pairs))
+    with house_style():
+        figure = empty_figure(width=9.0, height=0.4 + 2.6 * len(pairs))
         rows = figure.subplots(len(pairs), 1, squeeze=False)[:, 0]
         for axes, (record, output) in zip(rows, pairs, strict=True):
             unit = next(iter(fits.values())).model.unit(output)
-            factor, label = _scaled(record.outputs[output], unit)
-            axes.plot(record.time, record.outputs[output] / factor, color=_MEASURED, ls="none", marker=".", ms=2.5,
+            factor, label = scale_and_unit(record.outputs[output], unit)
+            axes.plot(record.time, record.outputs[output] / factor, color=MEASURED, ls="none", marker=".", ms=2.5,
                       label="measured", rasterized=True)  # fmt: skip
             for i, (name, fit) in enumerate(fits.items()):
                 initial = fit.initial_of(record)  # of a new record a fit of its own
                 percent = percent_of_fit(fit.score(record, initial).fit_percent[output])
                 axes.plot(record.time, fit.simulate(record, initial)[output] / factor, color=f"C{i}", lw=1.1,
-                          label=_plain(f"{name}: {percent}"))  # fmt: skip
-            axes.set(title=_plain(record.name), ylabel=f"{_words(output)}\n{label}", xlabel="time (s)")
+                          label=plain_text(f"{name}: {percent}"))  # fmt: skip
+            axes.set(title=plain_text(record.name), ylabel=f"{spaced(output)}\n{label}", xlabel="time (s)")
             axes.legend(loc="best")
         figure.align_ylabels()
     return figure
@@ -177,8 +169,8 @@ def plot_bode(linear: LinearModel) -> "matplotlib.figure.Figure":
     answers = np.any(response != 0.0, axis=0)
     decibel = 20.0 * np.log10(np.where(answers, np.abs(response), np.nan))
     phase = np.where(answers, np.unwrap(np.angle(response), axis=0), np.nan)
-    with _style():
-        figure = _figure(width=1.0 + 4.5 * len(linear.inputs), height=0.4 + 3.8 * len(linear.outputs))
+    with house_style():
+        figure = empty_figure(width=1.0 + 4.5 * len(linear.inputs), height=0.4 + 3.8 * len(linear.outputs))
         shape = (2 * len(linear.outputs), len(linear.inputs))
         rows = figure.subplots(*shape, squeeze=False, sharex=True, height_ratios=[1.6, 1.0] * len(linear.outputs))
         for (i, output), (k, name) in itertools.product(enumerate(linear.outputs), enumerate(linear.inputs)):
@@ -187,13 +179,13 @@ def plot_bode(linear: LinearModel) -> "matplotlib.figure.Figure":
                 (size, decibel[:, i, k], 20.0 / math.log(10.0) * reach.real[:, i, k]),
                 (angle, np.degrees(phase[:, i, k]), np.degrees(reach.imag[:, i, k])),
             ):
-                axes.fill_between(frequency / math.tau, curve - half, curve + half, color=_MODEL, alpha=0.25, lw=0)
-                axes.semilogx(frequency / math.tau, curve, color=_MODEL)
+                axes.fill_between(frequency / math.tau, curve - half, curve + half, color=MODEL, alpha=0.25, lw=0)
+                axes.semilogx(frequency / math.tau, curve, color=MODEL)
                 # What hardly changes is drawn as such.
                 low, high = axes.get_ylim()
                 axes.set_ylim(min(low, 0.5 * (low + high) - 5.0), max(high, 0.5 * (low + high) + 5.0))
             silent = "" if answers[i, k] else ": does not answer"
-            size.set(title=f"{_words(name)} to {_words(output)}{silent}", ylabel="size (dB)" if k == 0 else "")
+            size.set(title=f"{spaced(name)} to {spaced(output)}{silent}", ylabel="size (dB)" if k == 0 else "")
             angle.set(ylabel="phase (°)" if k == 0 else "")
             angle.locator_params(axis="y", nbins=5, steps=[1, 1.5, 3, 4.5, 9, 10])
         for axes in rows[-1]:
@@ -205,22 +197,22 @@ def plot_bode(linear: LinearModel) -> "matplotlib.figure.Figure":
 def plot_record(record: Record) -> "matplotlib.figure.Figure":
     """Draw every signal of a record over time, inputs as they run between samples; what is missing is marked below."""
     signals = {**record.inputs, **record.outputs}
-    with _style():
-        figure = _figure(width=9.0, height=0.6 + 1.5 * len(signals))
-        figure.suptitle(_plain(record.name), x=0.01, ha="left", fontweight="bold")
+    with house_style():
+        figure = empty_figure(width=9.0, height=0.6 + 1.5 * len(signals))
+        figure.suptitle(plain_text(record.name), x=0.01, ha="left", fontweight="bold")
         rows = figure.subplots(len(signals), 1, squeeze=False)[:, 0]
         for axes, (name, values) in zip(rows, signals.items(), strict=True):
             if name in record.inputs:
                 _draw_input(axes, record, name)
             else:
-                axes.plot(record.time, values, color=_MEASURED, ls="none", marker=".", ms=2.5, rasterized=True)
+                axes.plot(record.time, values, color=MEASURED, ls="none", marker=".", ms=2.5, rasterized=True)
             missing = record.time[~np.isfinite(values)]
             if len(missing):
-                axes.plot(missing, np.zeros(len(missing)), "|", color=_MODEL, transform=axes.get_xaxis_transform(),
+                axes.plot(missing, np.zeros(len(missing)), "|", color=MODEL, transform=axes.get_xaxis_transform(),
                           label=f"{len(missing)} missing")  # fmt: skip
-                _legend(axes)
-            axes.set_ylabel(_words(name))
-        _share_time(rows, record)
+                legend_above(axes)
+            axes.set_ylabel(spaced(name))
+        share_time(rows, record)
         figure.align_ylabels()
     return figure
 
@@ -238,8 +230,8 @@ def plot_experiment(
 
     """
     count = len(records[0].inputs) + 2 * len(outputs)
-    with _style():
-        figure = _figure(width=9.0, height=0.6 + 1.6 * count)
+    with house_style():
+        figure = empty_figure(width=9.0, height=0.6 + 1.6 * count)
         grid = figure.subplots(count, len(records), squeeze=False)
         for k, record in enumerate(records):
             _draw_experiment(grid[:, k], record, model, {name: each[k].outputs for name, each in said.items()}, outputs)
@@ -252,23 +244,23 @@ def plot_experiment(
 def _draw_experiment(rows, record: Record, model: Model, said: Mapping[str, Mapping[str, Any]], outputs) -> None:
     first, *others = said
     for axes, (name, values) in zip(rows, record.inputs.items(), strict=False):
-        factor, label = _scaled(values, model.unit(name))
+        factor, label = scale_and_unit(values, model.unit(name))
         _draw_input(axes, record, name, factor)
-        axes.set_ylabel(f"{_words(name)}\n{label}")
+        axes.set_ylabel(f"{spaced(name)}\n{label}")
     for i, output in enumerate(outputs):
         together, apart = rows[len(record.inputs) + 2 * i :][:2]
-        factor, label = _scaled(np.concatenate([one[output] for one in said.values()]), model.unit(output))
+        factor, label = scale_and_unit(np.concatenate([one[output] for one in said.values()]), model.unit(output))
         for k, (name, one) in enumerate(said.items()):
-            together.plot(record.time, one[output] / factor, color=f"C{k}", lw=1.0, label=_words(name))
-        together.set_ylabel(f"{_words(output)}\n{label}")
-        _legend(together)
+            together.plot(record.time, one[output] / factor, color=f"C{k}", lw=1.0, label=spaced(name))
+        together.set_ylabel(f"{spaced(output)}\n{label}")
+        legend_above(together)
         differences = {name: said[name][output] - said[first][output] for name in others}
-        factor, label = _scaled(np.concatenate(list(differences.values())), model.unit(output))
+        factor, label = scale_and_unit(np.concatenate(list(differences.values())), model.unit(output))
         for k, (name, values) in enumerate(differences.items(), 1):
-            apart.plot(record.time, values / factor, color=f"C{k}", lw=1.0, label=f"{_words(name)} − {_words(first)}")
+            apart.plot(record.time, values / factor, color=f"C{k}", lw=1.0, label=f"{spaced(name)} − {spaced(first)}")
         apart.set_ylabel(f"difference\n{label}")
-        _legend(apart)
-    _share_time(rows, record)
+        legend_above(apart)
+    share_time(rows, record)
 
 
 def plot_identification(
@@ -293,8 +285,8 @@ def plot_identification(
         raise ValueError(
             f"expected noise_free for each of {len(fits)} fits, got {len(known)}: leave it out or add some"
         )
-    with _style():
-        figure = _figure(width=8.0 if len(fits) == 1 else 5.4 * len(fits), height=6.4)
+    with house_style():
+        figure = empty_figure(width=8.0 if len(fits) == 1 else 5.4 * len(fits), height=6.4)
         columns = figure.subplots(3, len(fits), squeeze=False, height_ratios=[1.0, 2.4, 1.3]).T
         for axes, fit, true in zip(columns, fits, known or [{}] * len(fits), strict=True):
             _draw_identification(axes, fit, true)
@@ -310,8 +302,8 @@ def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
     names = list(found.profiles)
     columns = min(3, len(names))
     quantile = quantile_of(found.level)
-    with _style():
-        figure = _figure(width=3.4 * columns, height=2.6 * -(-len(names) // columns) + 0.3)
+    with house_style():
+        figure = empty_figure(width=3.4 * columns, height=2.6 * -(-len(names) // columns) + 0.3)
         every = figure.subplots(-(-len(names) // columns), columns, squeeze=False).ravel()
         for axes, name in zip(every, names, strict=False):
             profile, unit = found.profiles[name], found.units[name]
@@ -320,14 +312,14 @@ def plot_profiles(found: "ProfileLikelihood") -> "matplotlib.figure.Figure":
             factor = PREFIXES[prefix]
             if math.isfinite(error):
                 reach = 3.0 * error * np.array([-1.0, 1.0])
-                axes.plot((estimate + reach) / factor, [-3.0, 3.0], color=_MEASURED, ls=(0, (4, 3)))
-            axes.plot(profile.values / factor, profile.signed_root, color=_MODEL, marker=".", ms=4)
-            axes.axvspan(*(end / factor for end in profile.interval), color=_MODEL, alpha=0.12, lw=0)
-            axes.axhline(0.0, color=_AXIS, lw=0.8)
+                axes.plot((estimate + reach) / factor, [-3.0, 3.0], color=MEASURED, ls=(0, (4, 3)))
+            axes.plot(profile.values / factor, profile.signed_root, color=MODEL, marker=".", ms=4)
+            axes.axvspan(*(end / factor for end in profile.interval), color=MODEL, alpha=0.12, lw=0)
+            axes.axhline(0.0, color=AXIS, lw=0.8)
             axes.set_yticks([-quantile, 0.0, quantile], [f"−{quantile:.2f}", "0", f"{quantile:.2f}"])
             inside = [v for v, r in zip(profile.values, profile.signed_root, strict=True) if abs(r) < 2 * quantile]
             low, high = min(*inside, profile.interval[0]), max(*inside, profile.interval[1])
-            axes.set(title=_words(name), xlabel=_plain(f"{prefix}{unit}") if unit else "",
+            axes.set(title=spaced(name), xlabel=plain_text(f"{prefix}{unit}") if unit else "",
                      xlim=(low / factor, high / factor), ylim=(-2 * quantile, 2 * quantile))  # fmt: skip
             axes.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4), useOffset=False)
             axes.xaxis.get_major_locator().set_params(nbins=4)
@@ -364,11 +356,11 @@ def plot_corner(
         instance("profiles", profiles, ProfileLikelihood, "pass fit.profile_likelihood()")
         if not set(names) & set(profiles.profiles):
             raise ValueError(f"expected profiles of {', '.join(names)}, got {', '.join(profiles.profiles)}")
-    drawn_in = {name: _to_order_of_one(estimates[name], units[name]) for name in names}
+    drawn_in = {name: scale_to_order_of_one(estimates[name], units[name]) for name in names}
     values = {name: each / drawn_in[name][0] for name, each in ({} if draws is None else draws).items()}
     count = len(names)
-    with _style():
-        figure = _figure(width=1.5 * count + 1.2, height=1.5 * count + 0.8)
+    with house_style():
+        figure = empty_figure(width=1.5 * count + 1.2, height=1.5 * count + 0.8)
         grid = figure.subplots(count, count, squeeze=False, sharex="col")
         for i, j in itertools.product(range(count), repeat=2):
             axes, below, left = grid[i, j], names[j], names[i]
@@ -385,15 +377,15 @@ def plot_corner(
                 _draw_alone(axes, values.get(below), centre[0], spread[0, 0], profile, factors[0])
             else:
                 if values:
-                    axes.plot(values[below], values[left], ls="", marker=".", ms=3, color=_MEASURED, alpha=0.6)
-                axes.plot(*_ellipse(centre, spread), color=_COMMAND)
-                axes.plot(*centre, marker="+", ms=8, color=_TRUE)
+                    axes.plot(values[below], values[left], ls="", marker=".", ms=3, color=MEASURED, alpha=0.6)
+                axes.plot(*_ellipse(centre, spread), color=COMMAND)
+                axes.plot(*centre, marker="+", ms=8, color=TRUE)
                 axes.yaxis.get_major_locator().set_params(nbins=3)
                 axes.tick_params(labelleft=j == 0)
             if i == count - 1:
-                axes.set_xlabel(f"{_words(below)}\n{drawn_in[below][1]}")
+                axes.set_xlabel(f"{spaced(below)}\n{drawn_in[below][1]}")
             if j == 0 < i:
-                axes.set_ylabel(f"{_words(left)}\n{drawn_in[left][1]}")
+                axes.set_ylabel(f"{spaced(left)}\n{drawn_in[left][1]}")
         handles, labels = grid[0, 0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="upper right")
     return figure
@@ -403,16 +395,16 @@ def _draw_alone(axes, values, estimate: float, variance: float, profile, factor:
     """Draw the density of one parameter: of its draws, of linear theory, and the likelihood of its profile."""
     axes.set_yticks([])
     if values is not None:
-        axes.hist(values, bins="auto", density=True, color=_MEASURED, alpha=0.6, label="bootstrap")
+        axes.hist(values, bins="auto", density=True, color=MEASURED, alpha=0.6, label="bootstrap")
     reach = np.linspace(-3.5, 3.5, 141)
     if variance > 0.0:
         deviation = math.sqrt(variance)
         bell = np.exp(-0.5 * reach**2) / (math.sqrt(2.0 * math.pi) * deviation)
-        axes.plot(estimate + deviation * reach, bell, color=_COMMAND, label="linear theory (95% ellipse)")
+        axes.plot(estimate + deviation * reach, bell, color=COMMAND, label="linear theory (95% ellipse)")
     if profile is not None:
         at = np.linspace(profile.values[0], profile.values[-1], 141) / factor
         likelihood = np.exp(-0.5 * np.interp(at, profile.values / factor, profile.signed_root) ** 2)
-        axes.plot(at, likelihood / np.trapezoid(likelihood, at), color=_MODEL, label="profile likelihood")
+        axes.plot(at, likelihood / np.trapezoid(likelihood, at), color=MODEL, label="profile likelihood")
 
 
 def _ellipse(centre, covariance, level: float = 0.95):
@@ -430,10 +422,10 @@ def plot_pressure_flow() -> "matplotlib.figure.Figure":
     openings = np.array([0.2, 0.4, 0.6, 0.8, 1.0])
     # Closer towards stall, where the root is steep.
     pressures = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 401))
-    with _style():
-        figure = _figure(width=7.0, height=5.0)
+    with house_style():
+        figure = empty_figure(width=7.0, height=5.0)
         axes = figure.subplots()
-        for side, colour in ((1.0, _COMMAND), (-1.0, _MODEL)):
+        for side, colour in ((1.0, COMMAND), (-1.0, MODEL)):
             curves = np.asarray(normalised_pressure_flow_curves(side * openings, pressures))
             for opening, curve in zip(openings, curves, strict=True):
                 axes.plot(pressures, curve, color=colour)
@@ -445,40 +437,10 @@ def plot_pressure_flow() -> "matplotlib.figure.Figure":
         for spine in ("left", "bottom"):
             axes.spines[spine].set_visible(False)
         axes.tick_params(length=0)
-        axes.axhline(0, color=_AXIS, lw=0.8)
-        axes.axvline(0, color=_AXIS, lw=0.8)
+        axes.axhline(0, color=AXIS, lw=0.8)
+        axes.axvline(0, color=AXIS, lw=0.8)
         axes.set_title("on the curves: spool opening $x_v / x_{v,\\max}$", loc="right")
     return figure
-
-
-def _figure(width: float, height: float):
-    """Return an empty figure that a notebook shows without pyplot."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure._repr_png_ = functools.partial(to_png, figure)  # type: ignore[attr-defined]
-    return figure
-
-
-def to_png(figure: "matplotlib.figure.Figure", dots_per_inch: float = 110.0) -> bytes:
-    """Return a figure as the bytes of a PNG file, in a palette of 64 colours, which makes it three times smaller."""
-    from PIL import Image
-
-    drawn, small = io.BytesIO(), io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=dots_per_inch)
-    Image.open(drawn).convert("RGB").quantize(64).save(small, format="png", optimize=True)
-    return small.getvalue()
-
-
-def embedded(png: bytes) -> str:
-    """Return a PNG file as an address that an HTML page can hold itself."""
-    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
-
-
-def _style():
-    import matplotlib
-
-    return matplotlib.rc_context(_STYLE)
 
 
 def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
@@ -487,10 +449,10 @@ def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
     name = next(name for name in fit.outputs if name in record.outputs)
     measured, simulated, unit = record.outputs[name], fit.simulate(record)[name], fit.model.unit(name)
     command = fit.model.inputs[0]
-    factor, label = _scaled(record.inputs[command], fit.model.unit(command))
+    factor, label = scale_and_unit(record.inputs[command], fit.model.unit(command))
     style = "steps-post" if record.hold_of(command) == "zero" else "default"
-    command_axes.plot(record.time, record.inputs[command] / factor, color=_COMMAND, drawstyle=style)
-    command_axes.set(ylabel=f"{_words(command)}\n{label}", title=_plain(record.name))
+    command_axes.plot(record.time, record.inputs[command] / factor, color=COMMAND, drawstyle=style)
+    command_axes.set(ylabel=f"{spaced(command)}\n{label}", title=plain_text(record.name))
 
     series = {"measured": measured, "model": simulated}
     if name in true:
@@ -498,51 +460,51 @@ def _draw_identification(axes, fit: Fit, true: Mapping[str, Any]) -> None:
     _draw_series(output_axes, record.time, series, name, unit)
     _draw_residual(error_axes, record.time, measured - simulated, unit)
     if name in true:
-        factor, _ = _scaled(measured - simulated, unit)
-        error_axes.plot(record.time, (true[name] - simulated) / factor, color=_MODEL, label="noise-free − model")
-        _legend(error_axes)
-    _share_time(axes, record)
+        factor, _ = scale_and_unit(measured - simulated, unit)
+        error_axes.plot(record.time, (true[name] - simulated) / factor, color=MODEL, label="noise-free − model")
+        legend_above(error_axes)
+    share_time(axes, record)
 
 
 def _draw_input(axes, record: Record, name: str, factor: float = 1.0) -> None:
     """Draw an input as it runs between samples."""
     held = "steps-post" if record.hold_of(name) == "zero" else "default"
-    axes.plot(record.time, record.inputs[name] / factor, color=_COMMAND, drawstyle=held, lw=1.0)
+    axes.plot(record.time, record.inputs[name] / factor, color=COMMAND, drawstyle=held, lw=1.0)
 
 
 def _draw_series(axes, time, series: Mapping[str, Any], name: str, unit: str) -> None:
     looks: dict[str, dict[str, Any]] = {
-        "measured": {"color": _MEASURED, "ls": "none", "marker": ".", "ms": 2.5, "rasterized": True},
-        "noise-free": {"color": _TRUE, "ls": (0, (4, 3)), "lw": 1.1},
-        "model": {"color": _MODEL},
+        "measured": {"color": MEASURED, "ls": "none", "marker": ".", "ms": 2.5, "rasterized": True},
+        "noise-free": {"color": TRUE, "ls": (0, (4, 3)), "lw": 1.1},
+        "model": {"color": MODEL},
     }
-    factor, label = _scaled(np.concatenate(list(series.values())), unit)
+    factor, label = scale_and_unit(np.concatenate(list(series.values())), unit)
     for kind, values in series.items():
         absent = int(np.sum(~np.isfinite(values)))
         why = "missing" if kind == "measured" else NOT_FINITE
         axes.plot(time, values / factor, label=f"{kind} ({absent} {why})" if absent else kind, **looks[kind])
-    axes.set_ylabel(f"{_words(name)}\n{label}")
-    _legend(axes)
+    axes.set_ylabel(f"{spaced(name)}\n{label}")
+    legend_above(axes)
 
 
 def _draw_residual(axes, time, residual, unit: str, band: "Band | None" = None) -> None:
-    factor, label = _scaled(residual, unit)
+    factor, label = scale_and_unit(residual, unit)
     if band is not None:
         for half, alpha, words in ((band.measurement, 0.12, "95% of samples"), (band.model, 0.5, "95% of the model")):
-            axes.fill_between(time, -half / factor, half / factor, color=_MODEL, alpha=alpha, lw=0, label=words)
-    axes.plot(time, residual / factor, color=_MEASURED, ls="none", marker=".", ms=2.0, rasterized=True,
+            axes.fill_between(time, -half / factor, half / factor, color=MODEL, alpha=alpha, lw=0, label=words)
+    axes.plot(time, residual / factor, color=MEASURED, ls="none", marker=".", ms=2.0, rasterized=True,
               label="measured − model")  # fmt: skip
-    axes.axhline(0, color=_AXIS, lw=0.8)
+    axes.axhline(0, color=AXIS, lw=0.8)
     axes.set_ylabel(f"residual\n{label}")
     if band is not None:
-        _legend(axes)
+        legend_above(axes)
 
 
 def _draw_correlation(axes, found: Correlation, title: str) -> None:
     outside = np.abs(found.values) > found.band
-    axes.axhspan(-found.band, found.band, color=_MODEL, alpha=0.12, lw=0)
-    axes.vlines(found.lags, 0.0, found.values, colors=np.where(outside, _MODEL, _MEASURED), lw=1.6)
-    axes.axhline(0.0, color=_AXIS, lw=0.8)
+    axes.axhspan(-found.band, found.band, color=MODEL, alpha=0.12, lw=0)
+    axes.vlines(found.lags, 0.0, found.values, colors=np.where(outside, MODEL, MEASURED), lw=1.6)
+    axes.axhline(0.0, color=AXIS, lw=0.8)
     axes.set(title=title, xlabel="lag (samples)")
 
 
@@ -551,50 +513,8 @@ def _draw_search(axes, fit: Fit) -> None:
     median, best = (
         np.where(np.isfinite(cost), cost, np.nan) for cost in (fit.history.median_cost, fit.history.best_cost)
     )
-    axes.semilogy(generations, median, color=_MEASURED, marker=".", label="median of the generation")
-    axes.semilogy(generations, best, color=_MODEL, marker=".", label="best so far")
+    axes.semilogy(generations, median, color=MEASURED, marker=".", label="median of the generation")
+    axes.semilogy(generations, best, color=MODEL, marker=".", label="best so far")
     axes.set(xlabel="generation", ylabel="cost\n(noise variances)", title="genetic search")
     axes.xaxis.get_major_locator().set_params(integer=True)
-    _legend(axes)
-
-
-def _legend(axes, *below) -> None:
-    """Put the legend of the axes, and of those below, above their right end, where no data can lie."""
-    entries = [entry for one in (axes, *below) for entry in zip(*one.get_legend_handles_labels(), strict=True)]
-    handles, labels = zip(*entries, strict=True)
-    axes.legend(handles, labels, loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3, borderaxespad=0.0,
-                markerscale=3, columnspacing=1.2, handlelength=1.6)  # fmt: skip
-
-
-def _share_time(axes, record: Record) -> None:
-    """Give axes that stand above each other the record's time, written below the last."""
-    for upper in axes[:-1]:
-        upper.sharex(axes[-1])
-        upper.tick_params(labelbottom=False)
-    axes[-1].set(xlabel="time (s)", xlim=(record.time[0], record.time[-1] + record.duration / (len(record) - 1)))
-
-
-def _scaled(values, unit: str) -> tuple[float, str]:
-    """Return what to divide by, and the unit as it then reads in a label: metres of a few thousandths are in mm."""
-    finite = np.abs(values[np.isfinite(values)])
-    prefix = prefix_of(float(np.max(finite, initial=0.0)), unit)
-    return PREFIXES[prefix], _plain(f"({prefix}{unit})") if unit else "(–)"
-
-
-def _to_order_of_one(value: float, unit: str) -> tuple[float, str]:
-    """Return as `_scaled` does; where no prefix helps, a power of ten stands in the label instead of at the axis."""
-    factor, label = _scaled(np.array([value]), unit)
-    size = abs(value) / factor
-    if not 0.0 < size < math.inf or 1e-3 <= size < 1e4:
-        return factor, label
-    power = math.floor(math.log10(size))
-    return factor * 10.0**power, f"($10^{{{power}}}$ {_plain(unit)})"
-
-
-def _words(name: str) -> str:
-    return _plain(name.replace("_", " "))
-
-
-def _plain(text: str) -> str:
-    """Return a user's text as matplotlib draws it letter by letter, on one line: a dollar would begin a formula."""
-    return " ".join(text.splitlines()).replace("$", r"\$")
+    legend_above(axes)

@@ -11,10 +11,11 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 import ehsvjax.paper as paper
+from ehsvjax.drawing import embedded, to_png
 from ehsvjax.files import written_whole
 from ehsvjax.models import Model, servovalve, van_der_pol
 from ehsvjax.paper import Identification
-from ehsvjax.plots import embedded, plot_identification, plot_pressure_flow, to_png
+from ehsvjax.plots import plot_identification, plot_pressure_flow
 
 
 def write_report(

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_hex
 
-from ehsvjax.plots import plot_fit, plot_identification, plot_pressure_flow, quantity, to_png
+from ehsvjax.drawing import to_png
+from ehsvjax.plots import plot_fit, plot_identification, plot_pressure_flow, quantity
 from tests import hand_made
 
 TRUE_FORCE = np.array([2.4, 4.4, 6.4, 8.4])

@@ -11,8 +11,9 @@ from ehsvjax.checks import file_path, refused
 from ehsvjax.diagnosis.results import words
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 from ehsvjax.diagnosis.results.pictures import plot_diagnosis
+from ehsvjax.drawing import embedded, to_png
 from ehsvjax.files import written_whole
-from ehsvjax.plots import embedded, plot_fit, to_png
+from ehsvjax.plots import plot_fit
 from ehsvjax.quantities import quantity
 
 if TYPE_CHECKING:
