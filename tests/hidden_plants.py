@@ -1,4 +1,5 @@
-"""Independent plants with hidden effects: a servovalve and a Van der Pol oscillator, NumPy over a batch of records.
+"""Independent plants with hidden effects: a servovalve, one record after the other in a loop that Numba compiles, and a
+Van der Pol oscillator, NumPy over a batch of records.
 
 Nothing of the package is used here. Every record of a batch has its own effects, which the model to be diagnosed may
 or may not have; those named unknown_* are in no bank. SI units; a Gaussian of a given width is exp(-(z/width)^2/2).
@@ -10,9 +11,11 @@ stay within that form. The spool's filter is propagated exactly for an input tha
 """
 
 import math
+from collections import namedtuple
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 ANY_PHASE = (0.0, 0.0, 2.0 * math.pi)
@@ -111,12 +114,11 @@ class Valve(NamedTuple):
     stiffness: float = 1e4
 
 
-class Load(NamedTuple):
-    """State of the load: position m, velocity m/s, load pressure Pa, each [batch]."""
-
-    position: np.ndarray
-    velocity: np.ndarray
-    pressure: np.ndarray
+_NUMBERS = {f"{e}_{n}": size[0] for e, numbers in SERVOVALVE_EFFECTS.items() for n, size in numbers.items()}
+Sizes = namedtuple("Sizes", _NUMBERS)
+"""Every number of every effect of one servovalve, by the effect's name and the number's."""
+# Division by zero is infinite, as NumPy's is.
+_compiled = numba.njit(cache=True, error_model="numpy")
 
 
 def effect_sizes(model_name: str) -> dict[str, dict[str, tuple[float, float]]]:
@@ -150,58 +152,32 @@ def servovalve_with(
     """
     if unknown := set(valve) - set(Valve._fields):
         raise ValueError(f"unknown parameters of the servovalve: {sorted(unknown)}")
-    valve = Valve(**valve)
     sizes = _sizes_over_batch(effects, SERVOVALVE_EFFECTS)
     command = _checked_command(command, len(effects))
     batch, samples = command.shape
     substeps, step = _substeps(sample_period, fine_step)
-    duration = samples * sample_period
-    delayed = _delayed_command(command, sizes, step, substeps)
-    filters = np.broadcast_arrays(np.atleast_1d(valve.natural_frequency), valve.damping_ratio)
-    filter_matrix = np.stack([_filter_matrix(*one, step) for one in zip(*filters, strict=True)], axis=-1)
-    rate_limit, flexibility = sizes.get("spool_rate_limit"), sizes.get("structural_flexibility")
-    hysteresis, backlash = sizes.get("torque_motor_hysteresis", 0.0), sizes.get("feedback_backlash", 0.0)
-    lag = sizes.get("sensor_lag")
-
-    load = Load(np.full(batch, initial_position), np.zeros(batch), np.zeros(batch))
-    spool_and_input = np.zeros((4, batch))  # displacement, its rate, error at the start and at the end of the step
-    spool, rate, error, next_error = spool_and_input
-    fed_back, driven = np.zeros(batch), np.zeros(batch)
-    seen, sensed = load.position, load.position
-    position, displacement, pressure = np.empty((3, samples, batch))
-    for sample in range(samples):
-        position[sample], displacement[sample], pressure[sample] = sensed, spool, load.pressure
-        for substep, held in enumerate(delayed(sample)):
-            time = sample * sample_period + substep * step
-            expected = load.position + step * load.velocity
-            fed_back = _play(load.position, fed_back, backlash)
-            driven = _play(held - valve.feedback_gain * fed_back, driven, hysteresis)
-            error[:] = driven
-            next_error[:] = _play(held - valve.feedback_gain * _play(expected, fed_back, backlash), driven, hysteresis)
-            spool_between, spool_after, rate_after = np.einsum("ijb,jb->ib", filter_matrix, spool_and_input)
-            if rate_limit is not None:
-                excess = rate_after - _clipped(rate_after, -rate_limit, rate_limit)
-                rate_after = rate_after - excess
-                spool_after = spool_after - 0.5 * step * excess
-                spool_between = spool_between - 0.5 * step * FIRST**2 * excess
-            spool[:], rate[:] = spool_after, rate_after
-            load = _load_step(load, spool_between, spool_after, time, step, duration, valve, sizes)
-            previous, seen = seen, load.position
-            if flexibility is not None:
-                seen = seen + valve.piston_area * load.pressure / flexibility
-            sensed = seen if lag is None else _lagged(sensed, previous, seen, lag, step)
-    position = _sensed_position(position.T, np.arange(samples) / samples, sizes)
+    given = np.stack([np.broadcast_to(np.asarray(value, dtype=float), (batch,)) for value in Valve(**valve)], axis=1)
+    valves = [Valve(*one) for one in given.tolist()]
+    initial = np.broadcast_to(np.asarray(initial_position, dtype=float), (batch,))
+    delays, parts = _delay(sizes.get("transport_delay", np.zeros(batch)), step, substeps)
+    position, displacement, pressure = np.empty((3, batch, samples))
+    for i, one in enumerate(valves):
+        matrix = _filter_matrix(one.natural_frequency, one.damping_ratio, step)
+        timing = (substeps, step, int(delays[i]), float(parts[i]))
+        position[i], displacement[i], pressure[i] = _valve_and_load(
+            command[i], timing, matrix, one, _sizes_of(effects[i]), float(initial[i])
+        )
+    position = _sensed_position(position, np.arange(samples) / samples, sizes)
     if noise is not None:
         position = position + np.asarray(noise)
     if "sensor_quantisation" in sizes:
         quantum = sizes["sensor_quantisation"][:, None]
         safe = np.where(quantum > 0, quantum, 1.0)
         position = np.where(quantum > 0, safe * np.round(position / safe), position)
-    return {
-        "position": position,
-        "spool": displacement.T,
-        "load_pressure": _between_chambers(pressure, displacement, valve, sizes).T,
-    }
+    if "area_ratio" in sizes:
+        supply = given[:, [Valve._fields.index("supply_pressure")]]
+        pressure = _between_chambers(pressure, displacement, supply, sizes["area_ratio"][:, None])
+    return {"position": position, "spool": displacement, "load_pressure": pressure}
 
 
 def van_der_pol_with(
@@ -265,6 +241,12 @@ def _dahl(stretch, way, length):
     return stretch + way - np.abs(way) * middle / length
 
 
+def _sizes_of(effects: Mapping[str, Mapping[str, float]]) -> Sizes:
+    """Every number of one record's effects, absent ones at what means that."""
+    given = {f"{effect}_{name}": float(value) for effect, sizes in effects.items() for name, value in sizes.items()}
+    return Sizes(**(_NUMBERS | given))
+
+
 def _sizes_over_batch(effects, known):
     """Size [batch], or a tuple of sizes, of each effect that any record has; absent values in the other records."""
     for mapping in effects:
@@ -295,16 +277,22 @@ def _substeps(sample_period, fine_step):
     return count, sample_period / count
 
 
+def _delay(delay, step, substeps):
+    """A delay [batch] as whole samples and fine steps beyond them.
+
+    A delay of whole samples must not be off by one sample because of rounding.
+    """
+    whole = np.floor(delay / (step * substeps) + 1e-9).astype(int)
+    return whole, np.maximum(delay / step - whole * substeps, 0.0)
+
+
 def _delayed_command(command, sizes, step, substeps):
     """Return commands(sample), [substep, batch]: the delayed command's mean over each fine step of that sample.
 
     The mean in the one step that holds a jump keeps second order: it is right but for the second moment in time.
     """
     records = len(command)
-    delay = sizes.get("transport_delay", np.zeros(records))
-    # A delay of whole samples must not be off by one sample because of rounding.
-    whole = np.floor(delay / (step * substeps) + 1e-9).astype(int)
-    part = np.maximum(delay / step - whole * substeps, 0.0)
+    whole, part = _delay(sizes.get("transport_delay", np.zeros(records)), step, substeps)
     weight = np.clip(np.arange(1, substeps + 1)[:, None] - part, 0.0, 1.0)
     padded = np.concatenate([np.zeros((records, 1)), command], axis=1).T
     lanes = np.arange(records)
@@ -342,11 +330,6 @@ def _clipped(value, low, high):
     return np.minimum(np.maximum(value, low), high)  # np.clip costs several times more on short arrays
 
 
-def _play(value, output, width):
-    """Play operator: the output is dragged along so that it stays within +-width of the value."""
-    return _clipped(output, value - width, value + width)
-
-
 def _decay(time, time_constant):
     """exp(-time/time_constant), and 0 where there is no lag."""
     return np.where(time_constant > 0, np.exp(-time / np.where(time_constant > 0, time_constant, 1.0)), 0.0)
@@ -362,66 +345,116 @@ def _gaussian(value, place, width):
     return np.exp(-0.5 * ((value - place) / width) ** 2)
 
 
+@_compiled
+def _valve_and_load(command, timing, matrix, valve, sizes, initial_position):
+    """Position as the sensor's lag leaves it m, spool m and load pressure Pa of one record, each [time]."""
+    substeps, step, delay, part = timing
+    samples = len(command)
+    duration = samples * substeps * step
+    position, displacement, pressure = np.empty(samples), np.empty(samples), np.empty(samples)
+    load = (initial_position, 0.0, 0.0)
+    spool, rate, fed_back, driven = 0.0, 0.0, 0.0, 0.0
+    seen, sensed = initial_position, initial_position
+    width, backlash = sizes.torque_motor_hysteresis_width, sizes.feedback_backlash_width
+    for sample in range(samples):
+        position[sample], displacement[sample], pressure[sample] = sensed, spool, load[2]
+        new = command[sample - delay] if sample >= delay else 0.0
+        old = command[sample - delay - 1] if sample > delay else 0.0
+        for substep in range(substeps):
+            time = (sample * substeps + substep) * step
+            # The mean of the delayed command over the step: where it jumps, right but for the second moment in time.
+            weight = min(max(substep + 1 - part, 0.0), 1.0)
+            held = old * (1.0 - weight) + new * weight
+            fed_back = _dragged(load[0], fed_back, backlash)
+            driven = _dragged(held - valve.feedback_gain * fed_back, driven, width)
+            ahead = _dragged(load[0] + step * load[1], fed_back, backlash)
+            error = _dragged(held - valve.feedback_gain * ahead, driven, width)
+            spool_between, spool_after, rate_after = matrix @ np.array([spool, rate, driven, error])
+            limit = sizes.spool_rate_limit_rate
+            excess = rate_after - min(max(rate_after, -limit), limit)
+            spool, rate = spool_after - 0.5 * step * excess, rate_after - excess
+            spool_between -= 0.5 * step * FIRST**2 * excess
+            load = _load_step(load, spool_between, spool, time, step, duration, valve, sizes)
+            previous, seen = seen, load[0] + valve.piston_area * load[2] / sizes.structural_flexibility_stiffness
+            lag = sizes.sensor_lag_time_constant
+            decay = math.exp(-step / lag) if lag > 0.0 else 0.0
+            sensed = seen - (seen - previous) * (lag / step) * (1.0 - decay) + (sensed - previous) * decay
+    return position, displacement, pressure
+
+
+@_compiled
+def _dragged(value, output, width):
+    """Play operator: the output is dragged along so that it stays within +-width of the value."""
+    return min(max(output, value - width), value + width)
+
+
+@_compiled
+def _bell(value, place, width):
+    return math.exp(-0.5 * ((value - place) / width) ** 2)
+
+
+@_compiled
+def _softplus(value):
+    return max(value, 0.0) + math.log1p(math.exp(-abs(value)))
+
+
+@_compiled
 def _opening(spool, valve, sizes):
-    """Opening [batch], m: dead zone, then saturation."""
-    spool = spool - sizes.get("null_bias", 0.0)
-    asymmetry = sizes.get("asymmetric_dead_zone", 0.0)
+    """Opening, m: dead zone, then saturation."""
+    spool -= sizes.null_bias_bias
+    asymmetry = sizes.asymmetric_dead_zone_asymmetry
     low, high = -valve.dead_zone * (1.0 - asymmetry), valve.dead_zone * (1.0 + asymmetry)
-    inside = _clipped(spool, low, high)
-    opening = spool - inside
-    if "flow_gain_rounding" in sizes:
-        width = sizes["flow_gain_rounding"]
-        safe = np.where(width > 0, width, 1.0)
-        rounded = safe * (np.logaddexp(0.0, (spool - high) / safe) - np.logaddexp(0.0, (low - spool) / safe))
-        opening = np.where(width > 0, rounded, opening)
-    opening = opening + sizes.get("null_leakage", 0.0) * inside
-    return _clipped(opening, -valve.saturation, valve.saturation)
+    inside = min(max(spool, low), high)
+    opening, width = spool - inside, sizes.flow_gain_rounding_width
+    if width > 0.0:
+        opening = width * (_softplus((spool - high) / width) - _softplus((low - spool) / width))
+    opening += sizes.null_leakage_ratio * inside
+    return min(max(opening, -valve.saturation), valve.saturation)
 
 
+@_compiled
 def _conductance(opening, time, duration, valve, sizes):
-    """Flow per root of pressure [batch], m^3/(s Pa^0.5), not negative."""
-    conductance = valve.flow_gain * np.abs(opening)
-    if "area_ratio" in sizes:
-        conductance = conductance * np.sqrt(2.0 / (1.0 + sizes["area_ratio"] ** 3))
-    if "flow_gain_drift" in sizes:
-        conductance = conductance * (1.0 + sizes["flow_gain_drift"] * (time / duration))
-    if "flow_gain_curvature" in sizes:
-        conductance = conductance * (1.0 + sizes["flow_gain_curvature"] * (opening / valve.saturation) ** 2)
-    if "unknown_spool_notch" in sizes:
-        depth, place, width = sizes["unknown_spool_notch"]
-        conductance = conductance * (1.0 - depth * _gaussian(opening, place, width))
+    """Flow per root of pressure, m^3/(s Pa^0.5), not negative."""
+    conductance = valve.flow_gain * abs(opening) * math.sqrt(2.0 / (1.0 + sizes.area_ratio_ratio**3))
+    conductance *= 1.0 + sizes.flow_gain_drift_drift * (time / duration)
+    conductance *= 1.0 + sizes.flow_gain_curvature_curvature * (opening / valve.saturation) ** 2
+    if sizes.unknown_spool_notch_depth != 0.0:
+        at = _bell(opening, sizes.unknown_spool_notch_place, sizes.unknown_spool_notch_width)
+        conductance *= 1.0 - sizes.unknown_spool_notch_depth * at
     return conductance
 
 
+@_compiled
 def _external_force(x, time, valve, sizes):
-    """Force [batch], N, against positive motion at the position x, and the stiffness N/m; force = stiffness*x + it."""
-    force, stiffness = sizes.get("constant_load", 0.0), valve.stiffness
-    if "hardening_spring" in sizes:
-        force = force + sizes["hardening_spring"] * x * x * x
-    if "harmonic_load" in sizes:
-        amplitude, frequency, phase = sizes["harmonic_load"]
-        force = force + amplitude * np.sin(frequency * time + phase)
-    if "unknown_cogging" in sizes:
-        amplitude, pitch = sizes["unknown_cogging"]
-        force = force + amplitude * np.sin(2.0 * math.pi * x / pitch)
-    if "end_stop" in sizes:
-        place, stop = sizes["end_stop"]
-        stop = np.where(x > place, stop, 0.0)
-        stiffness = stiffness + stop
-        force = force - stop * np.where(stop > 0, place, 0.0)
+    """Force N against positive motion at the position x, and the stiffness N/m; force = stiffness*x + it."""
+    force, stiffness = sizes.constant_load_force, valve.stiffness
+    force += sizes.hardening_spring_coefficient * x * x * x
+    if sizes.harmonic_load_force != 0.0:
+        force += sizes.harmonic_load_force * math.sin(sizes.harmonic_load_frequency * time + sizes.harmonic_load_phase)
+    if sizes.unknown_cogging_force != 0.0:
+        force += sizes.unknown_cogging_force * math.sin(2.0 * math.pi * x / sizes.unknown_cogging_pitch)
+    if x > sizes.end_stop_position:
+        stiffness += sizes.end_stop_stiffness
+        force -= sizes.end_stop_stiffness * sizes.end_stop_position
     return force, stiffness
 
 
+@_compiled
 def _load_step(load, spool_between, spool_after, time, step, duration, valve, sizes):
-    """One step of Alexander's method for position, velocity and load pressure."""
+    """One step of Alexander's method for position m, velocity m/s and load pressure Pa."""
     part = FIRST * step
-    between = _load_stage(load, load.velocity, spool_between, time + part, part, duration, valve, sizes)
+    between = _load_stage(load, load[1], spool_between, time + part, part, duration, valve, sizes)
     # Where the second stage starts: the state plus (1 - FIRST)*step times its rates in the first stage.
     share = (1.0 - FIRST) / FIRST
-    start = Load(*(old + share * (new - old) for old, new in zip(load, between, strict=True)))
-    return _load_stage(start, between.velocity, spool_after, time + step, part, duration, valve, sizes)
+    start = (
+        load[0] + share * (between[0] - load[0]),
+        load[1] + share * (between[1] - load[1]),
+        load[2] + share * (between[2] - load[2]),
+    )
+    return _load_stage(start, between[1], spool_after, time + step, part, duration, valve, sizes)
 
 
+@_compiled
 def _load_stage(start, velocity, spool, time, step, duration, valve, sizes):
     """Backward Euler over `step` from a start; `velocity` is the one expected.
 
@@ -430,12 +463,13 @@ def _load_stage(start, velocity, spool, time, step, duration, valve, sizes):
     """
     opening = _opening(spool, valve, sizes)
     conductance = _conductance(opening, time, duration, valve, sizes)
-    for _ in range(2 if "stribeck_friction" in sizes or "supply_droop" in sizes else 1):
-        found = _balanced(start, velocity, opening, conductance, time, step, valve, sizes)
-        velocity = found.velocity
+    found = _balanced(start, velocity, opening, conductance, time, step, valve, sizes)
+    if sizes.stribeck_friction_force != 0.0 or sizes.supply_droop_resistance != 0.0:
+        found = _balanced(start, found[1], opening, conductance, time, step, valve, sizes)
     return found
 
 
+@_compiled
 def _balanced(start, velocity, opening, conductance, time, step, valve, sizes):
     """Solve a stage's balances of flow and force, with sticking exact, for everything else at the expected velocity.
 
@@ -443,67 +477,59 @@ def _balanced(start, velocity, opening, conductance, time, step, valve, sizes):
         A*V + Ct*P + C*(P - P_start)/step = G*w,    P = s*Ps - w*|w|,
         M*(V - V_start)/step = A*P - K*X - B*V - F - friction.
     """
-    x = start.position + step * velocity
+    old_position, old_velocity, old_pressure = start
+    x = old_position + step * velocity
     area = valve.piston_area
-    backward = area * (1.0 - sizes.get("area_asymmetry", 0.0))
-    supply = valve.supply_pressure - sizes.get("return_pressure", 0.0)
-    if "supply_droop" in sizes:
-        supply = supply - sizes["supply_droop"] * np.abs(velocity) * np.where(velocity < 0, backward, area)
-    if "unknown_position_dependent_supply" in sizes:
-        depth, place, width = sizes["unknown_position_dependent_supply"]
-        supply = supply - valve.supply_pressure * depth * _gaussian(x, place, width)
-    if "area_ratio" in sizes:
-        # Backward the supply acts on the smaller area.
-        supply = supply * np.where(opening < 0, sizes["area_ratio"], 1.0)
+    backward = area * (1.0 - sizes.area_asymmetry_asymmetry)
+    supply = valve.supply_pressure - sizes.return_pressure_pressure
+    supply -= sizes.supply_droop_resistance * abs(velocity) * (backward if velocity < 0.0 else area)
+    if sizes.unknown_position_dependent_supply_depth != 0.0:
+        at = _bell(x, sizes.unknown_position_dependent_supply_place, sizes.unknown_position_dependent_supply_width)
+        supply -= valve.supply_pressure * sizes.unknown_position_dependent_supply_depth * at
+    if opening < 0.0:
+        # Backward the supply acts on the smaller area of a piston with one rod.
+        supply *= sizes.area_ratio_ratio
     blocked = np.sign(opening) * supply  # load pressure without any flow
     mobility = step / valve.mass
     force, stiffness = _external_force(x, time, valve, sizes)
-    inertia = 1.0 + mobility * (step * stiffness + sizes.get("viscous_friction", 0.0))
-    momentum = start.velocity - mobility * (stiffness * start.position + force)
+    inertia = 1.0 + mobility * (step * stiffness + sizes.viscous_friction_coefficient)
+    momentum = old_velocity - mobility * (stiffness * old_position + force)
 
-    loss, lost, resting = 0.0, 0.0, blocked  # load pressure at rest, which is all of it without leakage
-    if "cross_piston_leakage" in sizes or "oil_compressibility" in sizes:
-        storage = sizes.get("oil_compressibility", 0.0) / step
-        loss = sizes.get("cross_piston_leakage", 0.0) + storage
-        lost = loss * blocked - storage * start.pressure
-        root = 2.0 * lost / (conductance + np.sqrt(conductance**2 + 4.0 * loss * np.abs(lost)) + 1e-300)
-        resting = blocked - root * np.abs(root)
-    if "area_asymmetry" in sizes:
-        guess = np.where(opening < 0, backward, area)
-        area = np.where(momentum + mobility * guess * resting < 0, backward, area)
+    storage = sizes.oil_compressibility_capacitance / step
+    loss = sizes.cross_piston_leakage_coefficient + storage
+    lost = loss * blocked - storage * old_pressure
+    root = 2.0 * lost / (conductance + math.sqrt(conductance**2 + 4.0 * loss * abs(lost)) + 1e-300)
+    resting = blocked - root * abs(root)  # load pressure at rest, which is all of it without leakage
+    if momentum + mobility * (backward if opening < 0.0 else area) * resting < 0.0:
+        area = backward
     push = mobility * area
-    friction, held = sizes.get("coulomb_friction"), 0.0
-    if "stribeck_friction" in sizes:
-        extra, fade = sizes["stribeck_friction"]
-        friction = (0.0 if friction is None else friction) + extra * np.exp(-((velocity / fade) ** 2))
-    if friction is not None:
-        unbalanced = momentum + push * resting
-        held = _clipped(unbalanced, -mobility * friction, mobility * friction)
+    friction = sizes.coulomb_friction_force
+    if sizes.stribeck_friction_force != 0.0:
+        friction += sizes.stribeck_friction_force * math.exp(-((velocity / sizes.stribeck_friction_velocity) ** 2))
+    unbalanced = momentum + push * resting
+    held = min(max(unbalanced, -mobility * friction), mobility * friction)
     ratio = inertia / area
     quadratic, linear = push + ratio * loss, ratio * conductance
     constant = momentum - held + push * blocked + ratio * lost
-    w = 2.0 * constant / (linear + np.sqrt(linear**2 + 4.0 * quadratic * np.abs(constant)) + 1e-300)
-    square = w * np.abs(w)
+    w = 2.0 * constant / (linear + math.sqrt(linear**2 + 4.0 * quadratic * abs(constant)) + 1e-300)
+    square = w * abs(w)
     velocity = (conductance * w + loss * square - lost) / area
-    if friction is not None:
-        velocity = np.where((held == unbalanced) & (friction > 0), 0.0, velocity)
-    position = start.position + step * velocity
+    if friction > 0.0 and held == unbalanced:
+        velocity = 0.0
+    position = old_position + step * velocity
     # A valve that closed during the step has stopped the load: what is left is the static balance.
-    pressure = np.where(conductance + loss > 0, blocked - square, (stiffness * position + force) / area)
-    return Load(position, velocity, pressure)
+    pressure = blocked - square if conductance + loss > 0.0 else (stiffness * position + force) / area
+    return position, velocity, pressure
 
 
-def _between_chambers(pressure, spool, valve, sizes):
+def _between_chambers(pressure, spool, supply, ratio):
     """Difference of the chambers' pressures, where the load's force over the larger area is a pressure.
 
     Each chamber has half of the valve; the flows into the one and out of the other are as the areas are.
     """
-    if "area_ratio" not in sizes:
-        return pressure
-    ratio, supply = sizes["area_ratio"], valve.supply_pressure
     ahead = np.where(spool < 0, pressure + ratio * supply, pressure + ratio**3 * supply) / (1.0 + ratio**3)
     behind = np.where(spool < 0, supply - ratio**2 * ahead, ratio**2 * (supply - ahead))
-    return ahead - behind
+    return np.where(ratio != 1.0, ahead - behind, pressure)
 
 
 def _sensed_position(position, fraction, sizes):
