@@ -1,5 +1,4 @@
-"""Independent plants with hidden effects: a servovalve, one record after the other in a loop that Numba compiles, and a
-Van der Pol oscillator, NumPy over a batch of records.
+"""Independent plants with hidden effects: a servovalve and a Van der Pol oscillator, in loops that Numba compiles.
 
 Nothing of the package is used here. Every record of a batch has its own effects, which the model to be diagnosed may
 or may not have; those named unknown_* are in no bank. SI units; a Gaussian of a given width is exp(-(z/width)^2/2).
@@ -114,9 +113,14 @@ class Valve(NamedTuple):
     stiffness: float = 1e4
 
 
-_NUMBERS = {f"{e}_{n}": size[0] for e, numbers in SERVOVALVE_EFFECTS.items() for n, size in numbers.items()}
-Sizes = namedtuple("Sizes", _NUMBERS)
-"""Every number of every effect of one servovalve, by the effect's name and the number's."""
+def _numbers(effects):
+    """Every number of every effect, by the effect's name and the number's: the value that means absent."""
+    return {f"{effect}_{name}": absent for effect, sizes in effects.items() for name, (absent, _, _) in sizes.items()}
+
+
+_OF_VALVE, _OF_OSCILLATOR = _numbers(SERVOVALVE_EFFECTS), _numbers(VAN_DER_POL_EFFECTS)
+ValveSizes = namedtuple("ValveSizes", _OF_VALVE, defaults=_OF_VALVE.values())
+OscillatorSizes = namedtuple("OscillatorSizes", _OF_OSCILLATOR, defaults=_OF_OSCILLATOR.values())
 # Division by zero is infinite, as NumPy's is.
 _compiled = numba.njit(cache=True, error_model="numpy")
 
@@ -165,7 +169,7 @@ def servovalve_with(
         matrix = _filter_matrix(one.natural_frequency, one.damping_ratio, step)
         timing = (substeps, step, int(delays[i]), float(parts[i]))
         position[i], displacement[i], pressure[i] = _valve_and_load(
-            command[i], timing, matrix, one, _sizes_of(effects[i]), float(initial[i])
+            command[i], timing, matrix, one, _sizes_of(effects[i], ValveSizes), float(initial[i])
         )
     position = _sensed_position(position, np.arange(samples) / samples, sizes)
     if noise is not None:
@@ -199,52 +203,69 @@ def van_der_pol_with(
     command = _checked_command(command, len(effects))
     batch, samples = command.shape
     substeps, step = _substeps(sample_period, fine_step)
-    duration = samples * sample_period
     # A static nonlinearity of the input commutes with its delay and with holding it.
     command = _shaped_input(command, sizes)
-    delayed = _delayed_command(command, sizes, step, substeps)
-    input_lag, sensor_lag, dahl = sizes.get("input_lag"), sizes.get("sensor_lag"), sizes.get("elastic_friction")
-    acceleration = _smooth_acceleration(duration, gamma, sizes)
-    kicks = _process_noise(sizes, samples * substeps, step)
+    delays, parts = _delay(sizes.get("transport_delay", np.zeros(batch)), step, substeps)
+    constants = np.broadcast_arrays(alpha, gamma, np.zeros(batch))
+    starts = np.broadcast_to(np.asarray(initial, dtype=float), (batch, 2))
+    position, velocity = np.empty((2, batch, samples))
+    for i, start in enumerate(starts):
+        one = _sizes_of(effects[i], OscillatorSizes)
+        timing = (substeps, step, int(delays[i]), float(parts[i]))
+        oscillator = (float(constants[0][i]), float(constants[1][i]))
+        kicks = _process_noise(one, samples * substeps, step)
+        position[i], velocity[i] = _oscillation(command[i], timing, oscillator, one, (start[0], start[1]), kicks)
+    return {"position": _sensed_position(position, np.arange(samples) / samples, sizes), "velocity": velocity}
 
-    x1, x2 = np.broadcast_to(np.asarray(initial, dtype=float), (batch, 2)).T.copy()
-    lagged, stretch, sensed = np.zeros(batch), np.zeros(batch), x1
-    position, velocity = np.empty((2, samples, batch))
+
+@_compiled
+def _oscillation(command, timing, oscillator, sizes, initial, kicks):
+    """Position as the sensor's lag leaves it, and velocity, of one record, each [time]; `kicks` are of x2, [step]."""
+    substeps, step, delay, part = timing
+    alpha, gamma = oscillator
+    samples = len(command)
+    laws = (gamma, samples * substeps * step, sizes)
+    position, velocity = np.empty(samples), np.empty(samples)
+    (x1, x2), lagged, stretch, sensed = initial, 0.0, 0.0, initial[0]
+    input_lag, sensor_lag = sizes.input_lag_time_constant, sizes.sensor_lag_time_constant
+    stiffness, length = sizes.elastic_friction_stiffness, sizes.elastic_friction_length
     for sample in range(samples):
         position[sample], velocity[sample] = sensed, x2
-        for substep, held in enumerate(delayed(sample)):
-            time = sample * sample_period + substep * step
-            inputs = (held, held, held)
-            if input_lag is not None:
-                start = np.where(input_lag > 0, lagged, held)
-                inputs = (start, *(held + (start - held) * _decay(t, input_lag) for t in (0.5 * step, step)))
-                lagged = inputs[2]
-            before = x1
-            if dahl is not None:
-                rising = acceleration(x1, x2, time, inputs[0] - dahl[0] * stretch)
-                ahead = _dahl(stretch, alpha * step * (x2 + 0.5 * step * rising), dahl[1])
-                courses = (stretch, 0.5 * (stretch + ahead), ahead)
-                inputs = tuple(drive - dahl[0] * course for drive, course in zip(inputs, courses, strict=True))
-            x1, x2 = _van_der_pol_step(x1, x2, time, step, inputs, acceleration, alpha, sizes)
-            if dahl is not None:
-                stretch = _dahl(stretch, x1 - before, dahl[1])
-            if kicks is not None:
-                x2 = x2 + kicks[sample * substeps + substep]
-            sensed = x1 if sensor_lag is None else _lagged(sensed, before, x1, sensor_lag, step)
-    position = _sensed_position(position.T, np.arange(samples) / samples, sizes)
-    return {"position": position, "velocity": velocity.T}
+        for substep in range(substeps):
+            time = (sample * substeps + substep) * step
+            held = _delayed(command, sample, substep, delay, part)
+            start = lagged if input_lag > 0.0 else held
+            middle = held + (start - held) * _decay(0.5 * step, input_lag)
+            end = held + (start - held) * _decay(step, input_lag)
+            lagged, before = end, x1
+            # Dahl's stretch over the step, as the velocity is expected to run.
+            rising = _acceleration(x1, x2, time, start - stiffness * stretch, laws)
+            ahead = _dahl(stretch, alpha * step * (x2 + 0.5 * step * rising), length)
+            inputs = (
+                start - stiffness * stretch,
+                middle - stiffness * 0.5 * (stretch + ahead),
+                end - stiffness * ahead,
+            )
+            x1, x2 = _van_der_pol_step(x1, x2, time, step, inputs, alpha, laws)
+            stretch = _dahl(stretch, x1 - before, length)
+            if len(kicks) > 0:
+                x2 += kicks[sample * substeps + substep]
+            sensed = _lagged(sensed, before, x1, sensor_lag, step)
+    return position, velocity
 
 
+@_compiled
 def _dahl(stretch, way, length):
     """Stretch of what slides at a length, after a way: the midpoint rule."""
     middle = stretch + 0.5 * (way - np.abs(way) * stretch / length)
     return stretch + way - np.abs(way) * middle / length
 
 
-def _sizes_of(effects: Mapping[str, Mapping[str, float]]) -> Sizes:
-    """Every number of one record's effects, absent ones at what means that."""
-    given = {f"{effect}_{name}": float(value) for effect, sizes in effects.items() for name, value in sizes.items()}
-    return Sizes(**(_NUMBERS | given))
+def _sizes_of(effects, kind):
+    """Every number of one record's effects, of one of the kinds of sizes."""
+    return kind(
+        **{f"{effect}_{name}": float(value) for effect, some in effects.items() for name, value in some.items()}
+    )
 
 
 def _sizes_over_batch(effects, known):
@@ -286,23 +307,16 @@ def _delay(delay, step, substeps):
     return whole, np.maximum(delay / step - whole * substeps, 0.0)
 
 
-def _delayed_command(command, sizes, step, substeps):
-    """Return commands(sample), [substep, batch]: the delayed command's mean over each fine step of that sample.
+@_compiled
+def _delayed(command, sample, substep, delay, part):
+    """The mean of a delayed command over a fine step of a sample: zero before the record.
 
-    The mean in the one step that holds a jump keeps second order: it is right but for the second moment in time.
+    In the one step that holds a jump it keeps second order: it is right but for the second moment in time.
     """
-    records = len(command)
-    whole, part = _delay(sizes.get("transport_delay", np.zeros(records)), step, substeps)
-    weight = np.clip(np.arange(1, substeps + 1)[:, None] - part, 0.0, 1.0)
-    padded = np.concatenate([np.zeros((records, 1)), command], axis=1).T
-    lanes = np.arange(records)
-
-    def commands(sample):
-        new = padded[np.maximum(sample + 1 - whole, 0), lanes]
-        old = padded[np.maximum(sample - whole, 0), lanes]
-        return old * (1.0 - weight) + new * weight
-
-    return commands
+    new = command[sample - delay] if sample >= delay else 0.0
+    old = command[sample - delay - 1] if sample > delay else 0.0
+    weight = min(max(substep + 1 - part, 0.0), 1.0)
+    return old * (1.0 - weight) + new * weight
 
 
 def _filter_matrix(omega, damping, step):
@@ -326,23 +340,17 @@ def _exponential(matrix):
     return np.linalg.matrix_power(total, 2**halvings)
 
 
-def _clipped(value, low, high):
-    return np.minimum(np.maximum(value, low), high)  # np.clip costs several times more on short arrays
-
-
+@_compiled
 def _decay(time, time_constant):
     """exp(-time/time_constant), and 0 where there is no lag."""
-    return np.where(time_constant > 0, np.exp(-time / np.where(time_constant > 0, time_constant, 1.0)), 0.0)
+    return math.exp(-time / time_constant) if time_constant > 0.0 else 0.0
 
 
+@_compiled
 def _lagged(output, start, end, time_constant, step):
     """First-order lag of a signal that is linear over the step from start to end."""
     decay = _decay(step, time_constant)
     return end - (end - start) * (time_constant / step) * (1.0 - decay) + (output - start) * decay
-
-
-def _gaussian(value, place, width):
-    return np.exp(-0.5 * ((value - place) / width) ** 2)
 
 
 @_compiled
@@ -358,13 +366,9 @@ def _valve_and_load(command, timing, matrix, valve, sizes, initial_position):
     width, backlash = sizes.torque_motor_hysteresis_width, sizes.feedback_backlash_width
     for sample in range(samples):
         position[sample], displacement[sample], pressure[sample] = sensed, spool, load[2]
-        new = command[sample - delay] if sample >= delay else 0.0
-        old = command[sample - delay - 1] if sample > delay else 0.0
         for substep in range(substeps):
             time = (sample * substeps + substep) * step
-            # The mean of the delayed command over the step: where it jumps, right but for the second moment in time.
-            weight = min(max(substep + 1 - part, 0.0), 1.0)
-            held = old * (1.0 - weight) + new * weight
+            held = _delayed(command, sample, substep, delay, part)
             fed_back = _dragged(load[0], fed_back, backlash)
             driven = _dragged(held - valve.feedback_gain * fed_back, driven, width)
             ahead = _dragged(load[0] + step * load[1], fed_back, backlash)
@@ -376,9 +380,7 @@ def _valve_and_load(command, timing, matrix, valve, sizes, initial_position):
             spool_between -= 0.5 * step * FIRST**2 * excess
             load = _load_step(load, spool_between, spool, time, step, duration, valve, sizes)
             previous, seen = seen, load[0] + valve.piston_area * load[2] / sizes.structural_flexibility_stiffness
-            lag = sizes.sensor_lag_time_constant
-            decay = math.exp(-step / lag) if lag > 0.0 else 0.0
-            sensed = seen - (seen - previous) * (lag / step) * (1.0 - decay) + (sensed - previous) * decay
+            sensed = _lagged(sensed, previous, seen, sizes.sensor_lag_time_constant, step)
     return position, displacement, pressure
 
 
@@ -542,7 +544,7 @@ def _sensed_position(position, fraction, sizes):
     position = np.where(position < 0.0, (1.0 + size("sensor_asymmetry")) * position, position)
     position = (1.0 + size("sensor_gain")) * position + size("sensor_bias") + size("sensor_drift") * fraction
     limit = size("sensor_saturation", np.inf)
-    return _clipped(position, -limit, limit)
+    return np.clip(position, -limit, limit)
 
 
 def _shaped_input(command, sizes):
@@ -552,95 +554,86 @@ def _shaped_input(command, sizes):
         return sizes.get(effect, np.full(1, absent))[:, None]
 
     command = command * (1.0 + size("input_gain"))
-    command = command - _clipped(command, -size("input_dead_zone"), size("input_dead_zone"))
-    return _clipped(command, -size("input_saturation", np.inf), size("input_saturation", np.inf))
+    command = command - np.clip(command, -size("input_dead_zone"), size("input_dead_zone"))
+    return np.clip(command, -size("input_saturation", np.inf), size("input_saturation", np.inf))
 
 
 def _process_noise(sizes, steps, step):
-    """Increments of x2, [step, batch], or None."""
-    if "process_noise" not in sizes:
-        return None
-    intensity, seeds = sizes["process_noise"]
-    draws = [np.random.default_rng(seed).standard_normal(steps) for seed in seeds.astype(int)]
-    return np.sqrt(intensity * step) * np.stack(draws, axis=1)
+    """Increments of x2, [step]; none without a random force."""
+    if sizes.process_noise_intensity == 0.0:
+        return np.zeros(0)
+    draws = np.random.default_rng(int(sizes.process_noise_seed)).standard_normal(steps)
+    return np.sqrt(sizes.process_noise_intensity * step) * draws
 
 
-def _smooth_acceleration(duration, gamma, sizes):
-    """Return acceleration(x1, x2, time, input) of the oscillator, [batch], without the laws that jump."""
-    get = sizes.get
-    offset, threshold = get("asymmetric_damping", 0.0), get("damping_threshold", 1.0)
-    drift, linear, constant = get("parameter_drift", 0.0), get("linear_damping", 0.0), get("constant_force", 0.0)
-    one_way = get("one_way_damping", 0.0)
-    powers = [
-        (get(effect + "_stiffness"), power)
-        for effect, power in (("quadratic", 2), ("cubic", 3), ("quintic", 5))
-        if effect + "_stiffness" in sizes
-    ]
-
-    def acceleration(x1, x2, time, u):
-        damping = gamma * (1.0 + drift * (time / duration)) * (1.0 - ((x1 - offset) / threshold) ** 2) - linear
-        if "rayleigh_damping" in sizes:
-            damping = damping - sizes["rayleigh_damping"] * x2 * x2
-        if "quadratic_damping" in sizes:
-            damping = damping - sizes["quadratic_damping"] * np.abs(x2)
-        force = u + constant - x1 - one_way * np.abs(x2)
-        for coefficient, power in powers:
-            force = force - coefficient * x1**power
-        if "harmonic_force" in sizes:
-            amplitude, frequency, phase = sizes["harmonic_force"]
-            force = force + amplitude * np.cos(frequency * time + phase)
-        if "parametric_excitation" in sizes:
-            depth, frequency, phase = sizes["parametric_excitation"]
-            force = force - depth * np.cos(frequency * time + phase) * x1
-        if "unknown_bump" in sizes:
-            amplitude, place, width = sizes["unknown_bump"]
-            force = force + amplitude * _gaussian(x1, place, width)
-        return force + damping * x2
-
-    return acceleration
+@_compiled
+def _acceleration(x1, x2, time, u, laws):
+    """Acceleration of the oscillator, without the laws that jump."""
+    gamma, duration, sizes = laws
+    offset, threshold = sizes.asymmetric_damping_offset, sizes.damping_threshold_threshold
+    damping = gamma * (1.0 + sizes.parameter_drift_drift * (time / duration)) * (1.0 - ((x1 - offset) / threshold) ** 2)
+    damping -= sizes.linear_damping_coefficient + sizes.rayleigh_damping_coefficient * x2 * x2
+    damping -= sizes.quadratic_damping_coefficient * abs(x2)
+    force = u + sizes.constant_force_force - x1 - sizes.one_way_damping_coefficient * abs(x2)
+    force -= sizes.quadratic_stiffness_coefficient * x1**2
+    force -= sizes.cubic_stiffness_coefficient * x1**3
+    force -= sizes.quintic_stiffness_coefficient * x1**5
+    if sizes.harmonic_force_force != 0.0:
+        force += sizes.harmonic_force_force * math.cos(
+            sizes.harmonic_force_frequency * time + sizes.harmonic_force_phase
+        )
+    if sizes.parametric_excitation_depth != 0.0:
+        turned = sizes.parametric_excitation_frequency * time + sizes.parametric_excitation_phase
+        force -= sizes.parametric_excitation_depth * math.cos(turned) * x1
+    if sizes.unknown_bump_force != 0.0:
+        force += sizes.unknown_bump_force * _bell(x1, sizes.unknown_bump_place, sizes.unknown_bump_width)
+    return force + damping * x2
 
 
-def _van_der_pol_step(x1, x2, time, step, inputs, acceleration, alpha, sizes):
+@_compiled
+def _van_der_pol_step(x1, x2, time, step, inputs, alpha, laws):
     """One Runge-Kutta step of fourth order; the inputs are those at its start, middle and end.
 
     Laws that jump are replaced by their mean over the step, from the expected time of the jump: second order.
     """
+    sizes = laws[2]
     middle, half = time + 0.5 * step, 0.5 * step
-    first = acceleration(x1, x2, time, inputs[0])
-    damping = held = 0.0
-    if "unknown_step_damping" in sizes:
-        coefficient, place = sizes["unknown_step_damping"]
-        start, end = x1 - place, x1 + alpha * step * (x2 + 0.5 * step * first) - place
-        high = np.maximum(start, end)
-        damping = coefficient * _clipped(high / np.maximum(high - np.minimum(start, end), 1e-300), 0.0, 1.0)
-    if "coulomb_friction" in sizes:
-        friction, drive = sizes["coulomb_friction"], first - damping * x2
+    first = _acceleration(x1, x2, time, inputs[0], laws)
+    damping = held = rest = 0.0
+    sticks = False
+    if sizes.unknown_step_damping_coefficient != 0.0:
+        start = x1 - sizes.unknown_step_damping_place
+        end = start + alpha * step * (x2 + 0.5 * step * first)
+        share = max(start, end) / max(abs(end - start), 1e-300)
+        damping = sizes.unknown_step_damping_coefficient * min(max(share, 0.0), 1.0)
+    friction = sizes.coulomb_friction_force
+    if friction != 0.0:
+        drive = first - damping * x2
         v2 = x2 + half * (drive - friction * np.sign(x2))
-        change = acceleration(x1 + half * alpha * x2, v2, middle, inputs[1]) - damping * v2 - drive
+        change = _acceleration(x1 + half * alpha * x2, v2, middle, inputs[1], laws) - damping * v2 - drive
         sign, sticks, rest = _friction_over_step(x2, drive, change / half, friction, step)
         held = friction * sign
     a1 = first - damping * x2 - held
     v2 = x2 + half * a1
-    a2 = acceleration(x1 + half * alpha * x2, v2, middle, inputs[1]) - damping * v2 - held
+    a2 = _acceleration(x1 + half * alpha * x2, v2, middle, inputs[1], laws) - damping * v2 - held
     v3 = x2 + half * a2
-    a3 = acceleration(x1 + half * alpha * v2, v3, middle, inputs[1]) - damping * v3 - held
+    a3 = _acceleration(x1 + half * alpha * v2, v3, middle, inputs[1], laws) - damping * v3 - held
     v4 = x2 + step * a3
-    a4 = acceleration(x1 + step * alpha * v3, v4, time + step, inputs[2]) - damping * v4 - held
+    a4 = _acceleration(x1 + step * alpha * v3, v4, time + step, inputs[2], laws) - damping * v4 - held
+    if sticks:
+        return x1 + 0.5 * alpha * x2 * rest, 0.0
     position = x1 + alpha * step / 6.0 * (x2 + 2.0 * v2 + 2.0 * v3 + v4)
-    velocity = x2 + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-    if "coulomb_friction" in sizes:
-        position = np.where(sticks, x1 + 0.5 * alpha * x2 * rest, position)
-        velocity = np.where(sticks, 0.0, velocity)
-    return position, velocity
+    return position, x2 + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
 
 
+@_compiled
 def _friction_over_step(velocity, drive, drive_rate, friction, step):
-    """Mean sign of the velocity over a step, whether it ends at rest, and the time until rest s, each [batch]."""
-    direction = np.where(velocity != 0, np.sign(velocity), np.sign(drive))
+    """Mean sign of the velocity over a step, whether it ends at rest, and the time until rest, s."""
+    direction = np.sign(velocity) if velocity != 0.0 else np.sign(drive)
     rest = 0.0
     for _ in range(3):
-        slowing = friction * np.abs(direction) - direction * (drive + 0.5 * drive_rate * rest)
-        rest = np.minimum(np.abs(velocity) / np.where(slowing > 0, slowing, 1e-300), step)
-    drive = drive + drive_rate * rest
-    sticks = (friction > 0) & (rest < step) & (np.abs(drive) < friction)
+        slowing = friction * abs(direction) - direction * (drive + 0.5 * drive_rate * rest)
+        rest = min(abs(velocity) / (slowing if slowing > 0.0 else 1e-300), step)
+    drive += drive_rate * rest
+    sticks = friction > 0.0 and rest < step and abs(drive) < friction
     return (direction * rest + np.sign(drive) * (step - rest)) / step, sticks, rest
