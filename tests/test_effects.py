@@ -119,6 +119,16 @@ def test_every_effect_is_what_an_independent_plant_has(make, plant, period, comm
     assert off == {}
 
 
+def test_a_sensor_lags_before_its_readings_end():
+    """The plant's range ends behind all else, as a converter's does: the reading stays at its end until the lag is."""
+    sizes = {"sensor_lag": {"time_constant": 4e-3}, "sensor_saturation": {"limit": 0.01}}
+    truth = servovalve_with([sizes], COMMAND[None], 1e-3)["position"][0]
+    record = ehsvjax.Record(np.arange(len(COMMAND)) * 1e-3, {"command": COMMAND})
+    extended, absent = everything_attached(ehsvjax.servovalve(), len(COMMAND) * 1e-3)
+    values = absent | {"sensor_lag@position.time_constant": 4e-3, "sensor_saturation@position.limit": 0.01}
+    assert np.abs(ehsvjax.simulate(extended, record, values)["position"] - truth).max() < 4e-6
+
+
 @pytest.mark.parametrize(("make", "period"), [(ehsvjax.servovalve, 1e-3), (ehsvjax.van_der_pol, 0.02)])
 def test_every_effect_leaves_a_search_in_one_native_function(make, period, monkeypatch):
     model, _ = everything_attached(make(), 1.0)

@@ -233,7 +233,26 @@ INPUT = (
     ),
 )
 
+# In this order: mounting and coupling come before the transducer, and its electronics lag before their range ends.
 SENSOR = (
+    Effect(
+        "structural_flexibility",
+        "sensor",
+        (size("compliance", "{value}/N", lambda s: 1e-3 * s["value"] / max(s["load_force"], 1e-300)),),
+        lambda own, y, context: y + own["compliance"] * context["load_force"],
+        needs=("load_force",),
+        says="the mounting gives way under the load force",
+        settled_by="two loads at the same motion, or a sensor on the structure",
+    ),
+    Effect(
+        "sensor_backlash",
+        "sensor",
+        (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
+        follow_with_play,
+        memory=(0.0,),
+        says="the sensor is coupled with play",
+        settled_by="small triangles at three rates and amplitudes, with a gauge",
+    ),
     Effect(
         "sensor_gain",
         "sensor",
@@ -276,14 +295,6 @@ SENSOR = (
         settled_by="an external gauge on both sides of zero",
     ),
     Effect(
-        "sensor_saturation",
-        "sensor",
-        (limit("limit", "{value}", (0.98, 0.93, 0.85, 0.7, 0.5)),),
-        lambda own, y, context: jnp.clip(y, -own["limit"], own["limit"]),
-        says="the sensor ends before the motion does",
-        settled_by="move to the end by hand, with a gauge",
-    ),
-    Effect(
         "sensor_lag",
         "sensor",
         (size("time_constant", "s", _half_sample, _tenth_of_duration),),
@@ -293,21 +304,11 @@ SENSOR = (
         settled_by="a multisine of 5-40 Hz, or a second, faster sensor",
     ),
     Effect(
-        "sensor_backlash",
+        "sensor_saturation",
         "sensor",
-        (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
-        follow_with_play,
-        memory=(0.0,),
-        says="the sensor is coupled with play",
-        settled_by="small triangles at three rates and amplitudes, with a gauge",
-    ),
-    Effect(
-        "structural_flexibility",
-        "sensor",
-        (size("compliance", "{value}/N", lambda s: 1e-3 * s["value"] / max(s["load_force"], 1e-300)),),
-        lambda own, y, context: y + own["compliance"] * context["load_force"],
-        needs=("load_force",),
-        says="the mounting gives way under the load force",
-        settled_by="two loads at the same motion, or a sensor on the structure",
+        (limit("limit", "{value}", (0.98, 0.93, 0.85, 0.7, 0.5)),),
+        lambda own, y, context: jnp.clip(y, -own["limit"], own["limit"]),
+        says="the sensor ends before the motion does",
+        settled_by="move to the end by hand, with a gauge",
     ),
 )
