@@ -143,7 +143,7 @@ def servovalve_with(
     command: np.ndarray,
     sample_period: float,
     *,
-    noise: np.ndarray | None = None,
+    noise: np.ndarray | float = 0.0,
     initial_position: float | np.ndarray = 0.0,
     fine_step: float = SERVOVALVE_STEP,
     **valve: float | np.ndarray,
@@ -156,31 +156,24 @@ def servovalve_with(
     """
     if unknown := set(valve) - set(Valve._fields):
         raise ValueError(f"unknown parameters of the servovalve: {sorted(unknown)}")
-    sizes = _sizes_over_batch(effects, SERVOVALVE_EFFECTS)
+    sizes = [_sizes_of(some, SERVOVALVE_EFFECTS, ValveSizes) for some in effects]
     command = _checked_command(command, len(effects))
     batch, samples = command.shape
-    substeps, step = _substeps(sample_period, fine_step)
-    given = np.stack([np.broadcast_to(np.asarray(value, dtype=float), (batch,)) for value in Valve(**valve)], axis=1)
-    valves = [Valve(*one) for one in given.tolist()]
-    initial = np.broadcast_to(np.asarray(initial_position, dtype=float), (batch,))
-    delays, parts = _delay(sizes.get("transport_delay", np.zeros(batch)), step, substeps)
+    fraction, noise = np.arange(samples) / samples, np.broadcast_to(noise, command.shape)
+    given = np.broadcast_arrays(np.zeros(batch), *Valve(**valve), initial_position)[1:]
     position, displacement, pressure = np.empty((3, batch, samples))
-    for i, one in enumerate(valves):
-        matrix = _filter_matrix(one.natural_frequency, one.damping_ratio, step)
-        timing = (substeps, step, int(delays[i]), float(parts[i]))
-        position[i], displacement[i], pressure[i] = _valve_and_load(
-            command[i], timing, matrix, one, _sizes_of(effects[i], ValveSizes), float(initial[i])
-        )
-    position = _sensed_position(position, np.arange(samples) / samples, sizes)
-    if noise is not None:
-        position = position + np.asarray(noise)
-    if "sensor_quantisation" in sizes:
-        quantum = sizes["sensor_quantisation"][:, None]
-        safe = np.where(quantum > 0, quantum, 1.0)
-        position = np.where(quantum > 0, safe * np.round(position / safe), position)
-    if "area_ratio" in sizes:
-        supply = given[:, [Valve._fields.index("supply_pressure")]]
-        pressure = _between_chambers(pressure, displacement, supply, sizes["area_ratio"][:, None])
+    for i, size in enumerate(sizes):
+        *values, initial = (float(value[i]) for value in given)
+        one = Valve(*values)
+        timing = _timing(size.transport_delay_delay, sample_period, fine_step)
+        matrix = _filter_matrix(one.natural_frequency, one.damping_ratio, timing[1])
+        position[i], displacement[i], pressure[i] = _valve_and_load(command[i], timing, matrix, one, size, initial)
+        position[i] = _sensed_position(position[i], size.sensor_bias_bias + size.sensor_drift_drift * fraction, size)
+        position[i] += noise[i]
+        if size.sensor_quantisation_step > 0.0:
+            position[i] = size.sensor_quantisation_step * np.round(position[i] / size.sensor_quantisation_step)
+        if size.area_ratio_ratio != 1.0:
+            pressure[i] = _between_chambers(pressure[i], displacement[i], one.supply_pressure, size.area_ratio_ratio)
     return {"position": position, "spool": displacement, "load_pressure": pressure}
 
 
@@ -199,23 +192,23 @@ def van_der_pol_with(
     Takes one mapping of effects for each record and the initial (x1, x2), [2] or [batch, 2]; process noise of
     intensity q adds a variance of q*t to x2. Returns the measured position x1 and the velocity x2, [batch, time].
     """
-    sizes = _sizes_over_batch(effects, VAN_DER_POL_EFFECTS)
+    sizes = [_sizes_of(some, VAN_DER_POL_EFFECTS, OscillatorSizes) for some in effects]
     command = _checked_command(command, len(effects))
     batch, samples = command.shape
-    substeps, step = _substeps(sample_period, fine_step)
-    # A static nonlinearity of the input commutes with its delay and with holding it.
-    command = _shaped_input(command, sizes)
-    delays, parts = _delay(sizes.get("transport_delay", np.zeros(batch)), step, substeps)
-    constants = np.broadcast_arrays(alpha, gamma, np.zeros(batch))
+    alphas, gammas, _ = np.broadcast_arrays(alpha, gamma, np.zeros(batch))
     starts = np.broadcast_to(np.asarray(initial, dtype=float), (batch, 2))
     position, velocity = np.empty((2, batch, samples))
-    for i, start in enumerate(starts):
-        one = _sizes_of(effects[i], OscillatorSizes)
-        timing = (substeps, step, int(delays[i]), float(parts[i]))
-        oscillator = (float(constants[0][i]), float(constants[1][i]))
-        kicks = _process_noise(one, samples * substeps, step)
-        position[i], velocity[i] = _oscillation(command[i], timing, oscillator, one, (start[0], start[1]), kicks)
-    return {"position": _sensed_position(position, np.arange(samples) / samples, sizes), "velocity": velocity}
+    for i, size in enumerate(sizes):
+        timing = _timing(size.transport_delay_delay, sample_period, fine_step)
+        oscillator = (float(alphas[i]), float(gammas[i]))
+        kicks = _process_noise(size, samples * timing[0], timing[1])
+        # A static nonlinearity of the input commutes with its delay and with holding it.
+        shaped = _shaped_input(command[i], size)
+        start = (starts[i, 0], starts[i, 1])
+        position[i], velocity[i] = _oscillation(shaped, timing, oscillator, size, start, kicks)
+        bent = position[i] + size.sensor_cubic_coefficient * position[i] ** 3
+        position[i] = _sensed_position(bent, size.sensor_bias_bias, size)
+    return {"position": position, "velocity": velocity}
 
 
 @_compiled
@@ -261,29 +254,16 @@ def _dahl(stretch, way, length):
     return stretch + way - np.abs(way) * middle / length
 
 
-def _sizes_of(effects, kind):
+def _sizes_of(effects, known, kind):
     """Every number of one record's effects, of one of the kinds of sizes."""
+    for effect, parameters in effects.items():
+        if effect not in known:
+            raise ValueError(f"unknown effect {effect!r}; there are {sorted(known)}")
+        if set(parameters) != set(known[effect]):
+            raise ValueError(f"{effect} has the parameters {sorted(known[effect])}, not {sorted(parameters)}")
     return kind(
         **{f"{effect}_{name}": float(value) for effect, some in effects.items() for name, value in some.items()}
     )
-
-
-def _sizes_over_batch(effects, known):
-    """Size [batch], or a tuple of sizes, of each effect that any record has; absent values in the other records."""
-    for mapping in effects:
-        for effect, parameters in mapping.items():
-            if effect not in known:
-                raise ValueError(f"unknown effect {effect!r}; there are {sorted(known)}")
-            if set(parameters) != set(known[effect]):
-                raise ValueError(f"{effect} has the parameters {sorted(known[effect])}, not {sorted(parameters)}")
-    sizes = {}
-    for effect in {effect: None for mapping in effects for effect in mapping}:
-        arrays = [
-            np.array([float(mapping[effect][parameter]) if effect in mapping else absent for mapping in effects])
-            for parameter, (absent, _, _) in known[effect].items()
-        ]
-        sizes[effect] = arrays[0] if len(arrays) == 1 else tuple(arrays)
-    return sizes
 
 
 def _checked_command(command, batch):
@@ -293,18 +273,15 @@ def _checked_command(command, batch):
     return command
 
 
-def _substeps(sample_period, fine_step):
-    count = max(1, round(sample_period / fine_step))
-    return count, sample_period / count
-
-
-def _delay(delay, step, substeps):
-    """A delay [batch] as whole samples and fine steps beyond them.
+def _timing(delay, sample_period, fine_step):
+    """Fine steps of a sample, their length s, and a delay as whole samples and fine steps beyond them.
 
     A delay of whole samples must not be off by one sample because of rounding.
     """
-    whole = np.floor(delay / (step * substeps) + 1e-9).astype(int)
-    return whole, np.maximum(delay / step - whole * substeps, 0.0)
+    substeps = max(1, round(sample_period / fine_step))
+    step = sample_period / substeps
+    whole = math.floor(delay / (step * substeps) + 1e-9)
+    return substeps, step, whole, max(delay / step - whole * substeps, 0.0)
 
 
 @_compiled
@@ -531,31 +508,21 @@ def _between_chambers(pressure, spool, supply, ratio):
     """
     ahead = np.where(spool < 0, pressure + ratio * supply, pressure + ratio**3 * supply) / (1.0 + ratio**3)
     behind = np.where(spool < 0, supply - ratio**2 * ahead, ratio**2 * (supply - ahead))
-    return np.where(ratio != 1.0, ahead - behind, pressure)
+    return ahead - behind
 
 
-def _sensed_position(position, fraction, sizes):
-    """Static part of the sensor, on positions [batch, time] at fractions [time] of the record."""
-
-    def size(effect, absent=0.0):
-        return sizes.get(effect, np.full(1, absent))[:, None]
-
-    position = position + size("sensor_cubic") * position**3
-    position = np.where(position < 0.0, (1.0 + size("sensor_asymmetry")) * position, position)
-    position = (1.0 + size("sensor_gain")) * position + size("sensor_bias") + size("sensor_drift") * fraction
-    limit = size("sensor_saturation", np.inf)
-    return np.clip(position, -limit, limit)
+def _sensed_position(position, bias, sizes):
+    """Static part of the sensor, on positions [time]."""
+    position = np.where(position < 0.0, (1.0 + sizes.sensor_asymmetry_error) * position, position)
+    position = (1.0 + sizes.sensor_gain_error) * position + bias
+    return np.clip(position, -sizes.sensor_saturation_limit, sizes.sensor_saturation_limit)
 
 
 def _shaped_input(command, sizes):
-    """Gain, dead zone and saturation of the input, in this order, on [batch, time]."""
-
-    def size(effect, absent=0.0):
-        return sizes.get(effect, np.full(1, absent))[:, None]
-
-    command = command * (1.0 + size("input_gain"))
-    command = command - np.clip(command, -size("input_dead_zone"), size("input_dead_zone"))
-    return np.clip(command, -size("input_saturation", np.inf), size("input_saturation", np.inf))
+    """Gain, dead zone and saturation of the input, in this order, on [time]."""
+    command = command * (1.0 + sizes.input_gain_error)
+    command = command - np.clip(command, -sizes.input_dead_zone_width, sizes.input_dead_zone_width)
+    return np.clip(command, -sizes.input_saturation_limit, sizes.input_saturation_limit)
 
 
 def _process_noise(sizes, steps, step):

@@ -79,12 +79,11 @@ def noise_of(hidden: Hidden, rng, count: int) -> np.ndarray:
     return noise
 
 
-def plant(model: str, effects: Sequence[Mapping], commands, period, noise=None) -> np.ndarray:
+def plant(model: str, effects: Sequence[Mapping], commands, period, noise=0.0) -> np.ndarray:
     """Return positions [record, time] of a plant."""
     if model == "servovalve":
         return servovalve_with(effects, commands, period, noise=noise)["position"]
-    position = van_der_pol_with(effects, commands, period)["position"]
-    return position if noise is None else position + noise
+    return van_der_pol_with(effects, commands, period)["position"] + noise
 
 
 class Made(NamedTuple):
