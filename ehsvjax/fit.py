@@ -50,6 +50,18 @@ EXPLAINS_NOTHING = "the model explains nothing of"
 """How the warning begins that comes before everything else."""
 
 
+def at_bounds(model: Model, parameters: Mapping[str, float]) -> list[tuple[str, str]]:
+    """Return the free parameters that are at a bound, each with its side, "lower" or "upper"."""
+    found = []
+    for name in model.free:
+        p = model.parameter(name)
+        for side, bound in (("lower", p.lower), ("upper", p.upper)):
+            size = abs(bound) if p.scale == "log" else p.upper - p.lower
+            if abs(parameters[name] - bound) < 1e-6 * size:
+                found.append((name, side))
+    return found
+
+
 def at_bound(name: str, side: str, what: str = "") -> str:
     """Return the warning of a fit whose parameter is at its "lower" or "upper" bound."""
     return f"{name} is at its {side} bound{what}: widen bounds={{{name!r}: ...}} or fix it"

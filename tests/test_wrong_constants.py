@@ -1,5 +1,7 @@
 """A constant that was given wrong is found under its own name, in one group with what looks the same."""
 
+from dataclasses import replace
+
 import jax
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 import ehsvjax
 from ehsvjax.diagnosis import diagnose
 from tests.plants import held_levels, servovalve_plant
-from tests.small_models import MASS, STIFFNESS, carriage, carriage_plant, modulated_plant, record_of
+from tests.small_models import DAMPING, MASS, STIFFNESS, carriage, carriage_plant, modulated_plant, record_of
 
 # One process compiles for one model.
 of_a_carriage = pytest.mark.xdist_group("diagnoses of a carriage")
@@ -59,6 +61,51 @@ def test_a_constant_that_is_certain_is_not_blamed_though_it_is_off():
     found = diagnosed(carriage(mass=1.3 * MASS), carriage_plant(PUSH, PERIOD)[:, 0], seed=2)
     assert found.verdict != "adequate"
     assert "mass" not in suspected(found), str(found)
+
+
+def of_mass(given: float, **bounds) -> ehsvjax.Model:
+    """Return the carriage with a mass that is given, and may have been given wrong, or is between some bounds."""
+    model = carriage(mass=given).with_bounds(bounds)
+    return replace(model, parameters=tuple(p._replace(certain=False) for p in model.parameters))
+
+
+@of_a_carriage
+def test_a_constant_that_is_off_by_a_factor_of_twelve_is_found():
+    # An error that ended at ten times as much left something, which a dead zone and a softer spring stood for.
+    found = diagnosed(of_mass(MASS / 12.0), carriage_plant(PUSH, PERIOD)[:, 0], seed=3)
+    assert (found.verdict, found.names) == ("named", ("mass",)), str(found)
+    assert 1.0 + found.extended.parameters["mass.error"] == pytest.approx(12.0, rel=0.01)
+
+
+@of_a_carriage
+def test_a_parameter_beyond_its_bounds_is_named_and_no_cause_that_stands_for_it(tmp_path):
+    found = diagnosed(of_mass(5.0, mass=(4.0, 10.0)), carriage_plant(PUSH, PERIOD)[:, 0], seed=6)
+    assert (found.verdict, found.names) == ("named", ("mass",)), str(found)
+    assert "mass (2 kg, certain)" in str(found)
+    assert "instead of the 4 kg at which its bound holds it" in str(found)
+    # What holds a parameter is given in the extended model; its error is found there.
+    better = found.extended
+    assert better.model.parameter("mass").value == pytest.approx(4.0)
+    assert better.parameters["mass.error"] == pytest.approx(MASS / 4.0 - 1.0, abs=0.01)
+    found.save(tmp_path / "found.zip")
+    assert str(ehsvjax.Diagnosis.load(tmp_path / "found.zip", model=of_mass(5.0, mass=(4.0, 10.0)))) == str(found)
+
+
+@of_a_carriage
+def test_a_parameter_that_noise_drives_to_its_bound_leaves_noise():
+    # The bound is where the truth is: half of all records have their minimum beyond it.
+    at_truth = carriage().with_bounds({"damping": (DAMPING, 10.0)})
+    verdicts = [diagnosed(at_truth, carriage_plant(PUSH, PERIOD)[:, 0], seed).verdict for seed in range(20, 26)]
+    assert verdicts == ["adequate"] * 6
+
+
+@of_a_carriage
+def test_a_dead_zone_of_most_of_the_input_is_found():
+    half_width = 0.7 * np.max(np.abs(PUSH))
+    passed = np.sign(PUSH) * np.maximum(np.abs(PUSH) - half_width, 0.0)
+    found = diagnosed(carriage(), carriage_plant(passed, PERIOD)[:, 0], seed=4)
+    assert (found.verdict, found.names) == ("named", ("input_dead_zone",)), str(found)
+    assert found.causes[0].sizes[0].value == pytest.approx(half_width, rel=0.01)
 
 
 @of_a_carriage

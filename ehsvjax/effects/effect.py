@@ -300,8 +300,11 @@ def amplitude(
 
 
 def relative_error(usual: float | None = None) -> EffectParameter:
-    """Return by what share something is more than it is taken for: ten times as much or a tenth at most."""
-    number = amplitude("error", "", constant(1e-3), constant(-0.9), constant(9.0), usual)
+    """Return by what share something is more than it is taken for.
+
+    It is a thousand times as much at most, or a thousandth, as where a unit was mistaken.
+    """
+    number = amplitude("error", "", constant(1e-3), constant(-0.999), constant(999.0), usual)
     return number._replace(relative=True)
 
 
@@ -321,16 +324,16 @@ def size(
     return amplitude(name, unit, probe, constant(0.0), upper)
 
 
-def width(name: str, unit: str, tries: Sequence[float], upper: float = 0.5) -> EffectParameter:
-    """Return a width that is never negative and whose effect is not proportional to it; shares of the signal's size.
+def width(name: str, unit: str, tries: Sequence[float]) -> EffectParameter:
+    """Return a width, from nothing to the signal's size, whose effect is not proportional to it; shares of that size.
 
     Raises:
-        ValueError: for tries that are no positive numbers, or an upper bound that is none.
+        ValueError: for tries that are no positive numbers.
 
     """
-    tries, upper = _shares(tries), positive("upper", upper)
+    tries = _shares(tries)
     return EffectParameter(
-        name, unit, 0.0, constant(0.0), lambda s: upper * s["value"], lambda s: [t * s["value"] for t in tries]
+        name, unit, 0.0, constant(0.0), lambda s: s["value"], lambda s: [t * s["value"] for t in tries]
     )
 
 

@@ -2,7 +2,7 @@
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, input_named, off_by_error, relative_error
 from ehsvjax.models.model import Model
@@ -10,15 +10,21 @@ from ehsvjax.models.model import Model
 _FEEDTHROUGH = "feedthrough_of_"
 
 
-def effects_for(model: Model) -> tuple[Effect, ...]:
+def effects_for(model: Model, held: Collection[str] = ()) -> tuple[Effect, ...]:
     """Return the candidate causes that no bank can hold, as their names are the model's.
 
     A constant of zero that is a signal of the diagram too has the effects of that signal's kind.
+
+    Args:
+        model: the model.
+        held: free parameters that their bounds hold: what a bound says may be as wrong as a constant.
+
     """
     signals = {s.name for s in model.signals}
     constants = [p for p in model.parameters if p.fixed and not p.certain and "." not in p.name]
     return (
         *(_off(p.name) if p.value else _there(p.name) for p in constants if p.value or p.name not in signals),
+        *(_off(name) for name in held),
         *(_feedthrough(name) for name in model.inputs),
     )
 

@@ -247,7 +247,7 @@ SENSOR = (
     Effect(
         "sensor_backlash",
         "sensor",
-        (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
+        (width("half_width", "{value}", (0.002, 0.01, 0.03)),),
         follow_with_play,
         memory=(0.0,),
         says="the sensor is coupled with play",

@@ -51,7 +51,7 @@ VALVE = (
     Effect(
         "torque_motor_hysteresis",
         "drive",
-        (width("half_width", "{value}", (0.003, 0.01, 0.03), upper=0.3),),
+        (width("half_width", "{value}", (0.003, 0.01, 0.03)),),
         follow_with_play,
         memory=(0.0,),
         says="the torque motor follows its current with a play",
@@ -60,7 +60,7 @@ VALVE = (
     Effect(
         "feedback_backlash",
         "feedback",
-        (width("half_width", "{value}", (0.002, 0.01, 0.03), upper=0.2),),
+        (width("half_width", "{value}", (0.002, 0.01, 0.03)),),
         follow_with_play,
         memory=(0.0,),
         says="the feedback follows the piston with a play",
@@ -105,7 +105,7 @@ VALVE = (
     Effect(
         "flow_gain_rounding",
         "opening",
-        (width("width", "{value}", (0.003, 0.01, 0.03), upper=0.3),),
+        (width("width", "{value}", (0.003, 0.01, 0.03)),),
         _rounded,
         needs=("spool", "dead_zone", "saturation"),
         says="the lands' edges are round",

@@ -173,6 +173,10 @@ def refit(
             trial[i] = points[i] + step
         # Near the minimum no valley is left to follow.
         _bend(bench, noise, trial, np.flatnonzero(running & bending), points, chosen, kept, damping, lower, upper)
+    for i, here in enumerate(kept):
+        if here is not None:
+            # What a bound holds can do nothing.
+            every_slope[i, _held(points[i], chosen[i], here.gradient, lower, upper)] = 0.0
     nothing = np.full(readings.shape, np.nan)
     residuals = np.stack([k.residual if k else nothing for k in kept])
     return Refits(points, cost, residuals, every_slope, chosen, converged)
@@ -240,8 +244,7 @@ def _step(point, chosen, gradient, information, damping, lower, upper):
     """
     columns = np.maximum(chosen, 0)
     room = np.stack([lower[columns], upper[columns]]) - point[columns]
-    pushed_out = ((room[1] <= 0) & (gradient > 0)) | ((room[0] >= 0) & (gradient < 0))
-    free = (chosen >= 0) & (np.diag(information) > 0) & ~pushed_out
+    free = (chosen >= 0) & (np.diag(information) > 0) & ~_held(point, chosen, gradient, lower, upper)
     moved, able = np.zeros(len(chosen)), free.copy()
     while able.any():
         moved[able] = _damped(
@@ -255,6 +258,13 @@ def _step(point, chosen, gradient, information, damping, lower, upper):
     step = np.zeros(len(point))
     step[chosen[free]] = moved[free]
     return step, float(gradient[free] @ moved[free])
+
+
+def _held(point, chosen, gradient, lower, upper) -> Bool[np.ndarray, " direction"]:
+    """Return which of the chosen unknowns are at a bound that the gradient pushes outwards."""
+    columns = np.maximum(chosen, 0)
+    at_lower, at_upper = point[columns] <= lower[columns], point[columns] >= upper[columns]
+    return (at_upper & (gradient > 0)) | (at_lower & (gradient < 0))
 
 
 def _damped(information, gradient, damping):

@@ -11,7 +11,7 @@ from ehsvjax.effects.effect import PROBED, Candidate, Effect, EffectParameter, S
 from ehsvjax.effects.extended import disturbance, extended
 from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
 from ehsvjax.effects.of_model import differences_for, effects_for
-from ehsvjax.fit import Fit
+from ehsvjax.fit import Fit, at_bounds
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import observed_outputs
 from ehsvjax.record import Record
@@ -73,7 +73,8 @@ def _bench(
     model = fit.model
     observed = observed_outputs(model, records)
     # A single record differs from none.
-    own = (*effects_for(model), *(differences_for(model) if len(records) > 1 else ()))
+    held = [name for name, _ in at_bounds(model, fit.parameters) if fit.parameters[name]]
+    own = (*effects_for(model, held), *(differences_for(model) if len(records) > 1 else ()))
     found = candidates(model, (*bank, *own), internal.contexts, observed)
     places = tuple(s.name for s in model.signals if s.kind in _PLACES and s.name in internal.values)
     probes = {place: _probe(internal.values[place]) for place in places} | dict(probes)

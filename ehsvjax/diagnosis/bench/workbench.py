@@ -118,11 +118,11 @@ class Workbench:
     def columns_with(self, included: Sequence[int]) -> list[int]:
         """Columns of the nominal model's unknowns and of some candidates' numbers, by their positions.
 
-        Of a parameter that is another in every record, what all have in common is none besides: it does the same.
+        Of a parameter that is another in every record, or another than its bounds allow, there is none besides: it does
+        the same.
         """
         some = [self.candidates[i] for i in included]
-        changed = [constant_of(c.effect) for c in some if c.effect.by_record and c.effect.kind == "constant"]
-        replaced = {self.column.get(name) for name in changed}
+        replaced = {j for c in some for j in self._replaced_by(c)}
         base = [j for j in self.base_columns if j not in replaced]
         return [*base, *(j for c in some for j in self.columns_of(c))]
 
@@ -131,8 +131,14 @@ class Workbench:
         return len(self.records) > 1 and self.candidates[candidate].effect.of_run
 
     def numbers_of(self, candidate: int) -> int:
-        """How many numbers the effect of a candidate has."""
-        return len(self.columns_of(self.candidates[candidate]))
+        """How many numbers more the effect of a candidate has than the model without it."""
+        there = self.candidates[candidate]
+        return len(self.columns_of(there)) - len(self._replaced_by(there))
+
+    def _replaced_by(self, candidate: Candidate) -> list[int]:
+        """Columns of the nominal model's unknowns for which an effect's numbers stand."""
+        name = constant_of(candidate.effect)
+        return [self.column[name]] if candidate.effect.kind == "constant" and name in self.column else []
 
     def search_of(self, candidate: int) -> float:
         """Noise variances that chance gains by a search for a frequency, where a candidate has one.

@@ -11,8 +11,8 @@ from ehsvjax.diagnosis.decision.search import Selection
 from ehsvjax.doubts import about_arithmetic
 from ehsvjax.effects.effect import UNLIMITED
 from ehsvjax.effects.extended import extended
-from ehsvjax.fit import Effort, Fit, History, at_bound
-from ehsvjax.models.model import Model, Parameter
+from ehsvjax.fit import Effort, Fit, History, at_bound, at_bounds
+from ehsvjax.models.model import Parameter
 from ehsvjax.population import to_values
 
 # Bounds of an effect's number that has none: this many times its value.
@@ -56,7 +56,10 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> F
                 next(own for own in of_run if name not in own)[name] = value
     model = bench.fit.model
     if attached:
-        model = extended(model, attached, numbers, duration_of(records))
+        # What stands for a parameter beyond its bound is a share of it.
+        beyond = {c.signal for c in attached if c.effect.kind == "constant" and not c.effect.by_record}
+        given = model.with_bounds(fixed={name: values[name] for name in model.free if name in beyond})
+        model = extended(given, attached, numbers, duration_of(records))
     step_size = min(record.sample_period for record in records) / int(bench.problem.substeps)
     if bench.problem.substeps > bench.problem.grid.substeps:
         model = replace(model, max_step=step_size)
@@ -87,7 +90,7 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> F
         effort=effort,
         history=History(*(np.zeros(0),) * 4, best={}),
         huber=None,
-        warnings=(*about_arithmetic(model, effort), *_at_bounds(model, parameters)),
+        warnings=(*about_arithmetic(model, effort), *(at_bound(*held) for held in at_bounds(model, parameters))),
     )
 
 
@@ -104,13 +107,3 @@ def _variances(selection: Selection, refits: Refits) -> dict[str, float]:
         name: float(np.mean(refits.residual[0][..., i][problem.samples.measured[..., i]] ** 2))
         for i, name in enumerate(problem.observed)
     }
-
-
-def _at_bounds(model: Model, parameters: dict[str, float]) -> tuple[str, ...]:
-    found = []
-    for name, value in parameters.items():
-        p = model.parameter(name)
-        for side, bound in (("lower", p.lower), ("upper", p.upper)):
-            if abs(value - bound) < 1e-6 * (p.upper - p.lower):
-                found.append(at_bound(name, side))
-    return tuple(found)

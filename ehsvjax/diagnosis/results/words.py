@@ -9,6 +9,7 @@ from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, how_sure
+from ehsvjax.models.model import Parameter
 from ehsvjax.quantities import quantity
 
 if TYPE_CHECKING:
@@ -119,8 +120,8 @@ def _brief(diagnosis: "Diagnosis", cause: Cause) -> str:
     """Return the first number of a cause; none where each record has its own."""
     if not cause.sizes or cause.sizes[0].record is not None:
         return ""
-    if _given(diagnosis, cause):
-        return ""
+    if own := _of_model(diagnosis, cause):
+        return quantity(own[1], own[0].unit)
     waves = {size.number: size.value for size in cause.sizes}
     if {"cosine", "sine"} <= set(waves):
         return quantity(np.hypot(waves["cosine"], waves["sine"]), cause.sizes[0].unit)
@@ -241,14 +242,24 @@ def _number_words(cause: Cause, number: str) -> str:
 
 
 def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
-    """Return what a constant is instead of what was given; nothing for any other cause."""
-    given = next((p for p in diagnosis.fit.model.parameters if p.name == cause.name), None)
-    if given is None or not cause.sizes or cause.sizes[0].number not in ("error", "value"):
+    """Return what a constant is instead of what was given, or a parameter beyond its bound; nothing of other causes."""
+    own = _of_model(diagnosis, cause)
+    if own is None:
         return ""
+    given, value, error = own
+    there, before = quantity(value, given.unit, error, 4), quantity(given.value, given.unit, digits=4)
+    where = "at which its bound holds it" if given.name in diagnosis.fit.model.free else "that was given"
+    return f"{cause.name}: {there} instead of the {before} {where}"
+
+
+def _of_model(diagnosis: "Diagnosis", cause: Cause) -> tuple[Parameter, float, float] | None:
+    """Return the model's number that a cause says is another, what it is and its error; None for other causes."""
+    given = next((p for p in diagnosis.extended.model.parameters if p.name == cause.name), None)
+    if given is None or not cause.sizes or cause.sizes[0].number not in ("error", "value"):
+        return None
     size = cause.sizes[0]
     factor, offset = (given.value, given.value) if size.number == "error" else (1.0, 0.0)
-    there = quantity(offset + factor * size.value, given.unit, factor * size.standard_error, 4)
-    return f"{cause.name}: {there} instead of the {quantity(given.value, given.unit, digits=4)} that was given"
+    return given, offset + factor * size.value, factor * size.standard_error
 
 
 def _of_each(names: Sequence[str], by_record: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, Any]]:
