@@ -55,11 +55,11 @@ def about_record(model: Model, record: Record, name: str) -> tuple[float, str]:
     bears with a gain and an offset but not with another sign, another unit of time or of an input.
     """
     start = {p.name: p.value for p in model.initial}
-    share, slope, _ = _straight(record, simulate(model, record, model.nominal, start), name)
+    share, slope, _ = _straight(record.outputs[name], simulate(model, record, model.nominal, start)[name])
     others = [_Trial(share, f"the opposite sign of {name}, or of {', '.join(model.inputs)},")] if slope < 0 else []
     share = share if slope > 0 else 0.0
     for changed, words in _other_records(model, record, name):
-        explained, slope, _ = _straight(changed, simulate(model, changed, model.nominal, start), name)
+        explained, slope, _ = _straight(changed.outputs[name], simulate(model, changed, model.nominal, start)[name])
         others += [_Trial(explained, words)] if slope > 0 else []
     best = max(others, key=lambda trial: round(trial.share, 2), default=_Trial(0.0, ""))
     better = best.share > max(_MOST, share + _BETTER)
@@ -216,7 +216,7 @@ def _trials(model: Model, record: Record, parameters, start, name: str) -> Itera
     nominal = model.nominal, {p.name: p.value for p in model.initial}
     for values, initial in ((parameters, start), nominal):
         if grid_of(model, record).substeps <= _STEPS:
-            share, slope, offset = _straight(record, simulate(model, record, values, initial), name)
+            share, slope, offset = _straight(record.outputs[name], simulate(model, record, values, initial)[name])
             if slope < 0:
                 yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
             elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
@@ -226,7 +226,7 @@ def _trials(model: Model, record: Record, parameters, start, name: str) -> Itera
                     share, f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
                 )
         for changed, words in _other_records(model, record, name):
-            share, slope, _ = _straight(changed, simulate(model, changed, values, initial), name)
+            share, slope, _ = _straight(changed.outputs[name], simulate(model, changed, values, initial)[name])
             if slope > 0:
                 yield _Trial(share, words)
 
@@ -242,11 +242,16 @@ def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Re
             yield changed, f"{factor:g} times {given} (mind the unit of its column)"
 
 
-def _straight(record: Record, simulated, name: str) -> tuple[float, float, float]:
+def turned_around(measured: Float[np.ndarray, " time"], simulated: Float[np.ndarray, " time"]) -> bool:
+    """Whether readings, NaN where there is none, are for the most part the simulated ones with the opposite sign."""
+    share, slope, _ = _straight(measured, simulated)
+    return slope < 0.0 and share > _MOST
+
+
+def _straight(measured, simulated) -> tuple[float, float, float]:
     """Return the share of the variance that a straight line of the simulated output explains, its slope and offset."""
-    measured, x = record.outputs[name], simulated[name]
     kept = np.isfinite(measured)
-    y, x = measured[kept], x[kept]
+    y, x = measured[kept], np.asarray(simulated)[kept]
     spread = float(np.var(x)) if np.isfinite(x).all() else 0.0
     if not 0.0 < spread < np.inf:
         return 0.0, 0.0, float(np.mean(y))

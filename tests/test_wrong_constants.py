@@ -100,6 +100,23 @@ def test_a_parameter_that_noise_drives_to_its_bound_leaves_noise():
 
 
 @of_a_carriage
+def test_a_record_that_starts_beyond_its_bounds_leaves_noise():
+    position, velocity = carriage_plant(PUSH, PERIOD).T
+    fastest = int(np.argmax(np.abs(velocity)))
+    record = record_of(PERIOD, {"push": PUSH[fastest:]}, {"position": position[fastest:]}, NOISE, 11)
+    slow = carriage().with_bounds({"initial_velocity": (-0.1, 0.1)})
+    fit = ehsvjax.identify(slow, record, key=KEY, population=40, generations=15)
+    assert any("initial_velocity is at its" in warning for warning in fit.warnings)
+    assert diagnose(fit, record, key=KEY).verdict == "adequate"
+
+
+@of_a_carriage
+def test_a_column_with_the_wrong_sign_is_refused():
+    with pytest.raises(ValueError, match=r"position of bench to run as it is simulated.*scale=-1\.0"):
+        diagnosed(carriage(), -carriage_plant(PUSH, PERIOD)[:, 0], seed=1)
+
+
+@of_a_carriage
 def test_a_dead_zone_of_most_of_the_input_is_found():
     half_width = 0.7 * np.max(np.abs(PUSH))
     passed = np.sign(PUSH) * np.maximum(np.abs(PUSH) - half_width, 0.0)

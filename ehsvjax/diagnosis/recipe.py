@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ehsvjax.checks import flag
 from ehsvjax.diagnosis.bench.progress import Progress
@@ -23,6 +23,7 @@ from ehsvjax.diagnosis.results.extension import as_fit
 from ehsvjax.diagnosis.results.gain import gain_of
 from ehsvjax.diagnosis.results.misfit import misfit_of
 from ehsvjax.diagnosis.results.suspects import excluded_by, table_of, unseen_by
+from ehsvjax.doubts import turned_around
 from ehsvjax.draws import check_key
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
@@ -163,6 +164,17 @@ def _check(fit, records, validation, key, progress) -> None:
     stack_records(fit.model, records)
 
 
+def _check_signs(bench: Workbench, simulated: Float[np.ndarray, "record time signal"]) -> None:
+    """Refuse records of which a column has the wrong sign: whatever were found would stand for that."""
+    for k, record in enumerate(bench.records):
+        for i, name in enumerate(bench.problem.observed):
+            if name in record.outputs and turned_around(record.outputs[name], simulated[k, : len(record), i]):
+                raise ValueError(
+                    f"expected {name} of {record.name} to run as it is simulated, and it runs the other way: give the "
+                    f"opposite sign to {name}, or to {', '.join(bench.fit.model.inputs)}, Column(..., scale=-1.0)"
+                )
+
+
 def _check_bank(bank) -> tuple[Effect, ...]:
     """Return the bank as a tuple."""
     expected = "expected bank to be a sequence of effects, such as (*ehsvjax.effects.BANK, my_effect)"
@@ -184,6 +196,7 @@ def _check_bank(bank) -> tuple[Effect, ...]:
 def _without_spikes(bench: Workbench) -> tuple[Workbench, Bool[np.ndarray, "record time signal"]]:
     """Return the bench without readings that stand alone, and where they are."""
     samples = bench.problem.samples
-    residual = samples.outputs - bench.simulated(bench.nominal[None])[0]
-    alone = spikes(residual, samples.measured, samples.outputs)
+    simulated = bench.simulated(bench.nominal[None])[0]
+    _check_signs(bench, simulated)
+    alone = spikes(samples.outputs - simulated, samples.measured, samples.outputs)
     return with_readings(bench, samples.measured & ~alone), alone

@@ -302,9 +302,9 @@ def amplitude(
 def relative_error(usual: float | None = None) -> EffectParameter:
     """Return by what share something is more than it is taken for.
 
-    It is a thousand times as much at most, or a thousandth, as where a unit was mistaken.
+    It is a million times as much at most, or a millionth, as where a unit was mistaken.
     """
-    number = amplitude("error", "", constant(1e-3), constant(-0.999), constant(999.0), usual)
+    number = amplitude("error", "", constant(1e-3), constant(1e-6 - 1.0), constant(1e6 - 1.0), usual)
     return number._replace(relative=True)
 
 

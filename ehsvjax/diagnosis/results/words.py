@@ -9,6 +9,7 @@ from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, how_sure
+from ehsvjax.fit import EXPLAINS_NOTHING
 from ehsvjax.models.model import Parameter
 from ehsvjax.quantities import quantity
 
@@ -130,7 +131,7 @@ def _brief(diagnosis: "Diagnosis", cause: Cause) -> str:
 
 def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what the nominal model gets wrong, a line for each output."""
-    lines = []
+    lines = [warning for warning in diagnosis.fit.warnings if warning.startswith(EXPLAINS_NOTHING)]
     # What was fitted to these very records is refitted to where it was.
     as_fitted = set(diagnosis.records) == set(diagnosis.fit.records)
     for record, name, m in _of_each(_names(diagnosis), diagnosis.misfit.by_record):
