@@ -288,8 +288,7 @@ def of_effects() -> Iterator[Call]:
 
     yield from damaged("effects.amplitude", made(effects.amplitude), number | probe | bound)
     yield from damaged("effects.size", made(effects.size), number | probe | {"upper": bound["upper"]})
-    yield from damaged("effects.width", made(effects.width),
-        number | {"tries": ([0.1], tries), "upper": (0.5, POSITIVE)})  # fmt: skip
+    yield from damaged("effects.width", made(effects.width), number | {"tries": ([0.1], tries)})
     yield from damaged("effects.limit", made(effects.limit),
         number | {"tries": ([0.5], tries), "lower": (0.02, NOT_NEGATIVE | {"huge": 1e300})})  # fmt: skip
     yield from damaged("effects.shape", made(effects.shape), number | {"tries": (lambda s: [1.0], FUNCTION)} | bound)

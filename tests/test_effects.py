@@ -260,7 +260,7 @@ def test_an_effect_that_can_never_vanish_is_refused():
         ({"structural_flexibility.compliance": (0, 1)}, "load_force"),  # which this model does not pass on
         ({"sensor_bias.bias": (1, -1)}, r"finite bounds of sensor_bias\.bias with lower < upper, got \(1\.0, -1\.0\)"),
         ({}, "bounds of an effect's numbers, .*; got none"),
-        ({"transport_delay.delay": (-1.0, 1.0)}, r"transport_delay\.delay to be bounded by zero or more, got .* -1\.0"),
+        ({"input_lag.time_constant": (-1, 1)}, r"input_lag\.time_constant to be bounded by zero or more, got .* -1\.0"),
         ({"sensor_bias.bias": (0, 1), "sensor_bias@position.bias": (0, 1)}, r"bounds of sensor_bias\.bias once"),
         ({"sensor_bias.bias": (1,)}, r"bounds of sensor_bias\.bias as \(lower, upper\), got \(1,\)"),
         ({"sensor_bias.bias": 0.1}, r"bounds of sensor_bias\.bias as \(lower, upper\), got 0\.1"),

@@ -100,14 +100,14 @@ def test_a_parameter_that_noise_drives_to_its_bound_leaves_noise():
 
 
 @of_a_carriage
-def test_a_record_that_starts_beyond_its_bounds_leaves_noise():
-    position, velocity = carriage_plant(PUSH, PERIOD).T
-    fastest = int(np.argmax(np.abs(velocity)))
-    record = record_of(PERIOD, {"push": PUSH[fastest:]}, {"position": position[fastest:]}, NOISE, 11)
-    slow = carriage().with_bounds({"initial_velocity": (-0.1, 0.1)})
-    fit = ehsvjax.identify(slow, record, key=KEY, population=40, generations=15)
-    assert any("initial_velocity is at its" in warning for warning in fit.warnings)
-    assert diagnose(fit, record, key=KEY).verdict == "adequate"
+def test_channels_that_are_not_read_at_once_are_a_delay_of_less_than_nothing():
+    # A feedthrough and an error of the hold, both certain, stood for it.
+    position = carriage_plant(PUSH, PERIOD)[:, 0]
+    record = record_of(PERIOD, {"push": PUSH[:-3]}, {"position": position[3:]}, NOISE, 12)
+    fit = ehsvjax.identify(carriage(), record, key=KEY, population=40, generations=15)
+    found = diagnose(fit, record, key=KEY)
+    assert (found.verdict, found.names) == ("named", ("transport_delay",)), str(found)
+    assert found.causes[0].sizes[0].value == pytest.approx(-3.0 * PERIOD, rel=0.02)
 
 
 @of_a_carriage

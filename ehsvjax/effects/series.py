@@ -63,7 +63,7 @@ def _product(left, right):
 
 
 def _delayed(own, course, context):
-    """Delay by any time; before the record it was zero."""
+    """Delay by any time; before the record it was zero, and after it what it was at its end."""
     samples = own["delay"] / context["sample_period"]
     whole = jnp.floor(samples)
     part = samples - whole
@@ -178,9 +178,9 @@ INPUT = (
     Effect(
         "transport_delay",
         "input",
-        (size("delay", "s", _half_sample, _tenth_of_duration),),
+        (amplitude("delay", "s", _half_sample, lambda scales: -_tenth_of_duration(scales), _tenth_of_duration),),
         _delayed,
-        says="the input acts later",
+        says="the input acts later than it was read, or earlier, where channels are not read at once",
         settled_by="a multisine of 5-40 Hz at two amplitudes: a delay turns the phase in proportion to frequency",
     ),
     Effect(

@@ -101,11 +101,8 @@ class Workbench:
 
     @functools.cached_property
     def bounds(self) -> tuple[Float[np.ndarray, " parameter"], Float[np.ndarray, " parameter"]]:
-        """The least and the largest coordinate of every unknown; a record may start anywhere."""
+        """The least and the largest coordinate of every unknown."""
         lower, upper = np.zeros(len(self.nominal)), np.ones(len(self.nominal))
-        for name in self.problem.free_initial:
-            own = [self.column[f"{name}[{k}]"] for k in range(len(self.records))]
-            lower[own], upper[own] = -np.inf, np.inf
         for candidate in self.candidates:
             scales = self.scales[candidate.name]
             for number, j in self.unknowns_of(candidate):

@@ -22,6 +22,8 @@ class Size(NamedTuple):
         standard_error: in `unit`, by what is left of the records; NaN where nothing tells.
         unit: SI.
         record: the record of which it is, where each has its own; else None.
+        bound: "lower" or "upper", where that end of what makes sense holds it: it would be less, or more, or something
+            else stands behind it; else None.
 
     """
 
@@ -30,6 +32,7 @@ class Size(NamedTuple):
     standard_error: float
     unit: str
     record: str | None = None
+    bound: str | None = None
 
 
 class Cause(NamedTuple):
@@ -119,14 +122,16 @@ def _share(selection: Selection, k: int) -> float:
 
 def _sizes(selection: Selection, position: int, extended: Fit, errors: Mapping[int, float]) -> tuple[Size, ...]:
     bench, found = selection.bench, []
-    candidate = bench.candidates[position]
+    candidate, point = bench.candidates[position], selection.final.points[0]
     for number, column in bench.unknowns_of(candidate):
         name, named = candidate.parameter(number.name), bench.problem.names[column]
+        ends = zip(("lower", "upper"), bench.bounds, strict=True)
+        bound = next((side for side, end in ends if point[column] == end[column]), None)
         record = int(named.rpartition("[")[2].rstrip("]")) if named != name else None
         value = extended.parameters[name] if record is None else extended.records[record].constants[name]
         found.append(
             Size(number.name, value, errors.get(column, float("nan")), extended.model.parameter(name).unit,
-                 None if record is None else bench.records[record].name)
+                 None if record is None else bench.records[record].name, bound)
         )  # fmt: skip
     return tuple(found)
 

@@ -8,7 +8,7 @@ import numpy as np
 from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
-from ehsvjax.diagnosis.results.causes import Cause, how_sure
+from ehsvjax.diagnosis.results.causes import Cause, Size, how_sure
 from ehsvjax.fit import EXPLAINS_NOTHING
 from ehsvjax.models.model import Parameter
 from ehsvjax.quantities import quantity
@@ -122,11 +122,16 @@ def _brief(diagnosis: "Diagnosis", cause: Cause) -> str:
     if not cause.sizes or cause.sizes[0].record is not None:
         return ""
     if own := _of_model(diagnosis, cause):
-        return quantity(own[1], own[0].unit)
+        return quantity(own[1], own[0].unit) + _or_beyond(cause.sizes[0])
     waves = {size.number: size.value for size in cause.sizes}
     if {"cosine", "sine"} <= set(waves):
         return quantity(np.hypot(waves["cosine"], waves["sine"]), cause.sizes[0].unit)
-    return quantity(cause.sizes[0].value, cause.sizes[0].unit)
+    return quantity(cause.sizes[0].value, cause.sizes[0].unit) + _or_beyond(cause.sizes[0])
+
+
+def _or_beyond(size: Size) -> str:
+    """Return in which direction a size would go on, where the end of what makes sense holds it."""
+    return {"lower": " or less", "upper": " or more", None: ""}[size.bound]
 
 
 def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
@@ -236,7 +241,9 @@ def _number_words(cause: Cause, number: str) -> str:
     """Return one number of a cause with its standard error, of each record where each has its own."""
     each = [size for size in cause.sizes if size.number == number]
     values = ", ".join(
-        quantity(s.value, s.unit, s.standard_error, 4) + (f" in {s.record}" if s.record is not None else "")
+        quantity(s.value, s.unit, s.standard_error, 4)
+        + _or_beyond(s)
+        + (f" in {s.record}" if s.record is not None else "")
         for s in each
     )
     return f"{number} {values}"
