@@ -66,8 +66,8 @@ def diagnose(
 
     Raises:
         ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short,
-            an effect of yours that fits no signal of the model, or one that is in the bank
-            twice.
+            an output or an input of the wrong sign, an effect of yours that fits no signal of the model, or one that is
+            in the bank twice.
 
     """
     bank = _check_bank(BANK if bank is None else bank)

@@ -257,7 +257,7 @@ def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
     given, value, error = own
     there, before = quantity(value, given.unit, error, 4), quantity(given.value, given.unit, digits=4)
     where = "at which its bound holds it" if given.name in diagnosis.fit.model.free else "that was given"
-    return f"{cause.name}: {there} instead of the {before} {where}"
+    return f"{cause.name}: {there}{_or_beyond(cause.sizes[0])} instead of the {before} {where}"
 
 
 def _of_model(diagnosis: "Diagnosis", cause: Cause) -> tuple[Parameter, float, float] | None:
