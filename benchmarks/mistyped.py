@@ -129,8 +129,9 @@ SAID: dict[str, Callable[[str], bool]] = {
 
 def outcome(row) -> str:
     """Judge one trial."""
+    told = row["kind"] in SAID and SAID[row["kind"]](row.get("warning", ""))
     if row["verdict"] in ("refused", "failed"):
-        return "refused, and why" if row["verdict"] == "refused" and SAID[row["kind"]](row["warning"]) else "failed"
+        return "refused, and why" if told else "failed"
     meant = MEANT[row["name"]]
     groups = [set(group) for group in row["groups"]]
     alone = set(row["causes"]) - set().union(*groups)
@@ -138,7 +139,7 @@ def outcome(row) -> str:
     true = bool(alone & meant) or any(group & meant for group in groups)
     if true and not false:
         return "named" if row["verdict"] == "named" else "in a group with the truth"
-    if row["kind"] in SAID and SAID[row["kind"]](row["warning"]):
+    if told:
         return "said by the fit"
     if row["verdict"] in ("adequate", "unexplained"):
         return {"adequate": "not seen", "unexplained": "unexplained"}[row["verdict"]]
