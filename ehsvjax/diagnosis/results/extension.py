@@ -9,13 +9,12 @@ from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import duration_of
 from ehsvjax.diagnosis.decision.search import Selection
 from ehsvjax.doubts import about_arithmetic
-from ehsvjax.effects.effect import UNLIMITED
 from ehsvjax.effects.extended import extended
 from ehsvjax.fit import Effort, Fit, History, at_bound, at_bounds
 from ehsvjax.models.model import Parameter
 from ehsvjax.population import to_values
 
-# Bounds of an effect's number that has none: this many times its value.
+# Bounds of an effect's number, where what makes sense goes on beyond them: this many times its value.
 _REACH = 10.0
 
 
@@ -45,10 +44,9 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> F
         for number, column in bench.unknowns_of(candidate):
             name, named = candidate.parameter(number.name), names[column]
             value = float(values[named])
-            lower, upper = number.lower(scales), number.upper(scales)
             reach = _REACH * abs(value) or bench.problem.coordinates.upper[column]
-            lower = -reach if lower <= -UNLIMITED else min(lower, value)
-            upper = reach if upper >= UNLIMITED else max(upper, value)
+            lower = min(max(number.lower(scales), -reach), value)
+            upper = max(min(number.upper(scales), reach), value)
             numbers[name] = Parameter(name, name, bench.model.parameter(name).unit, value, lower, upper)
             if named != name:
                 assert number.absent is not None
