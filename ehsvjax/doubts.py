@@ -31,7 +31,8 @@ _STEPS = 1000
 _ONE_READING = 1.0
 NO_CHANGE = 1e-6
 """Changes of the sum of squares, in noise variances, that are none."""
-_DECADES = (1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4)
+# Of columns: decades, and inches.
+_UNITS = (1e-4, 1e-3, 1e-2, 1e-1, 1e1, 1e2, 1e3, 1e4, 0.0254, 1.0 / 0.0254, 25.4, 1.0 / 25.4)
 # Slope of readings over simulated ones from which on their unit is another.
 _OTHER_UNIT = 1.5
 _NORMAL_MEDIAN = 0.6744897501960817
@@ -193,21 +194,46 @@ def _fit(share: float) -> str:
 
 
 class _Trial(NamedTuple):
-    """What would explain an output, in words, and the share of its variance that it would."""
+    """What would explain an output, in words, the share of its variance that it would, and whether columns are wrong.
+
+    An output's size and zero are no such mistakes: its sensor may have them.
+    """
 
     share: float
     words: str
+    columns: bool = True
+
+
+def mistaken_columns(fit: Fit, record: Record, name: str, simulated: Float[np.ndarray, " time"]) -> str:
+    """Return which mistake in the columns would explain an output of which the fit explains nothing, "" if none would.
+
+    Args:
+        fit: of the model.
+        record: that holds the output.
+        name: of the output.
+        simulated: what the fit makes of it.
+
+    """
+    measured = record.outputs[name]
+    if np.nanmean((measured - simulated) ** 2) < (1.0 - _NOTHING) * np.nanvar(measured):
+        return ""
+    best = _best(fit.model, record, fit.parameters, fit.initial_of(record), name)
+    return f"{best.words} would give {_fit(best.share)}" if best.columns and best.share > _MOST else ""
 
 
 def _what_would(model: Model, record: Record, parameters, start, name: str) -> str:
-    trials = list(_trials(model, record, parameters, start, name))
-    best = max(trials, key=lambda trial: round(trial.share, 2), default=None)
-    if best is not None and best.share > _MOST:
+    best = _best(model, record, parameters, start, name)
+    if best.share > _MOST:
         return f"{best.words} would give {_fit(best.share)}"
     return (
         f"no other sign, unit or offset alone explains it: look at the columns of {name} and "
         f"{', '.join(model.inputs)}, at constants and at bounds"
     )
+
+
+def _best(model: Model, record: Record, parameters, start, name: str) -> _Trial:
+    trials = _trials(model, record, parameters, start, name)
+    return max(trials, key=lambda trial: round(trial.share, 2), default=_Trial(0.0, ""))
 
 
 def _trials(model: Model, record: Record, parameters, start, name: str) -> Iterator[_Trial]:
@@ -220,11 +246,11 @@ def _trials(model: Model, record: Record, parameters, start, name: str) -> Itera
             if slope < 0:
                 yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
             elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
-                yield _Trial(share, f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})")
+                words = f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})"
+                yield _Trial(share, words, columns=False)
             else:
-                yield _Trial(
-                    share, f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
-                )
+                words = f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
+                yield _Trial(share, words, columns=False)
         for changed, words in _other_records(model, record, name):
             share, slope, _ = _straight(changed.outputs[name], simulate(model, changed, values, initial)[name])
             if slope > 0:
@@ -232,20 +258,20 @@ def _trials(model: Model, record: Record, parameters, start, name: str) -> Itera
 
 
 def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Record, str]]:
-    """Yield the record with another unit of time, and with other signs and units of the inputs, unless that is slow."""
+    """Yield the record with another unit of time, and, unless that is slow, with its columns taken otherwise.
+
+    These are other signs and units of the inputs, and an input that was exchanged with the output.
+    """
     yield replace(record, time=1e-3 * record.time), "a thousandth of the time (is it in ms?)"
     for given in model.inputs if grid_of(model, record).substeps <= _STEPS else ():
-        values = record.inputs[given]
+        values, measured = record.inputs[given], record.outputs[name]
+        if np.isfinite(measured).all():
+            exchanged = {**record.inputs, given: measured}, {**record.outputs, name: values}
+            yield replace(record, inputs=exchanged[0], outputs=exchanged[1]), f"{given} and {name} exchanged"
         yield replace(record, inputs={**record.inputs, given: -values}), f"the opposite sign of {given}, or of {name},"
-        for factor in _DECADES:
+        for factor in _UNITS:
             changed = replace(record, inputs={**record.inputs, given: factor * values})
-            yield changed, f"{factor:g} times {given} (mind the unit of its column)"
-
-
-def turned_around(measured: Float[np.ndarray, " time"], simulated: Float[np.ndarray, " time"]) -> bool:
-    """Whether readings, NaN where there is none, are for the most part the simulated ones with the opposite sign."""
-    share, slope, _ = _straight(measured, simulated)
-    return slope < 0.0 and share > _MOST
+            yield changed, f"{factor:.3g} times {given} (mind the unit of its column)"
 
 
 def _straight(measured, simulated) -> tuple[float, float, float]:

@@ -33,7 +33,7 @@ def carriage(stiffness=STIFFNESS, mass=MASS, max_step=0.02) -> Model:
             Signal("velocity", "sensor", "m/s"),
         ),
         start=_carriage_start,
-        stepper=runge_kutta_4(_carriage_rates),
+        stepper=runge_kutta_4(carriage_rates),
         measure=_carriage_outputs,
         max_step=max_step,
     )
@@ -44,7 +44,7 @@ def _carriage_start(parameters, initial, inputs):
     return {"x": initial["initial_position"], "v": initial["initial_velocity"]}
 
 
-def _carriage_rates(parameters, state, inputs, signal):
+def carriage_rates(parameters, state, inputs, signal):
     x, v, u = state["x"], state["v"], signal("push", inputs["push"])
     driving = u * (1.0 - parameters["modulation"] * x) + signal("force", 0.0, position=x, velocity=v)
     return {"x": v, "v": (driving - parameters["damping"] * v - parameters["stiffness"] * x) / parameters["mass"]}

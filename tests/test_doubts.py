@@ -60,6 +60,24 @@ def test_a_model_that_explains_nothing_says_so_first_and_what_would(record, word
     assert share > 50.0
 
 
+@pytest.mark.parametrize(
+    ("record", "words"),
+    [
+        (_record(LEVEL + 0.01 * NOISE, -COMMAND), "the opposite sign of "),
+        (_record(COMMAND, LEVEL + 0.01 * NOISE), "command and level exchanged would give fit "),
+        (_record(1e4 * LEVEL + NOISE), ""),
+        (_record(LEVEL + 40.0), ""),
+        (_record(LEVEL + 0.01 * NOISE), ""),
+        (_record(NOISE), ""),
+    ],
+    ids=["sign", "exchanged", "size of the output", "zero of the output", "sound", "noise"],
+)
+def test_a_mistake_in_the_columns_is_told_from_what_a_sensor_may_have(record, words):
+    fit = _identified(record, initial="nominal")
+    found = doubts.mistaken_columns(fit, record, "level", fit.simulate(record)["level"])
+    assert found.startswith(words) and bool(found) == bool(words)
+
+
 def test_what_nothing_explains_is_not_explained():
     # Of another cause altogether, and no noise either.
     fit = _identified(_record(np.sin(0.8 * TIME)))

@@ -3,13 +3,24 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import ehsvjax
+from ehsvjax import Parameter, runge_kutta_4
 from ehsvjax.diagnosis import diagnose
 from tests.plants import held_levels, servovalve_plant
-from tests.small_models import DAMPING, MASS, STIFFNESS, carriage, carriage_plant, modulated_plant, record_of
+from tests.small_models import (
+    DAMPING,
+    MASS,
+    STIFFNESS,
+    carriage,
+    carriage_plant,
+    carriage_rates,
+    modulated_plant,
+    record_of,
+)
 
 # One process compiles for one model.
 of_a_carriage = pytest.mark.xdist_group("diagnoses of a carriage")
@@ -112,8 +123,33 @@ def test_channels_that_are_not_read_at_once_are_a_delay_of_less_than_nothing():
 
 @of_a_carriage
 def test_a_column_with_the_wrong_sign_is_refused():
-    with pytest.raises(ValueError, match=r"position of bench to run as it is simulated.*scale=-1\.0"):
+    with pytest.raises(
+        ValueError, match=r"of whose position it explains nothing; the opposite sign of position, or of"
+    ):
         diagnosed(carriage(), -carriage_plant(PUSH, PERIOD)[:, 0], seed=1)
+
+
+def limited(parameters, state, inputs, signal):
+    """Return the rates of a carriage whose drive ends at a force."""
+    highest = parameters["highest"]
+    push = {"push": jnp.clip(inputs["push"], -highest, highest)}
+    return carriage_rates(parameters, state, push, signal)
+
+
+@of_a_carriage
+def test_a_parameter_that_acts_beyond_its_bounds_only_is_found():
+    # Between them it changes nothing, so that no slope leads out of them: of a servovalve, a saturation that no command
+    # reached was an error of the input's gain.
+    highest = Parameter("highest", "F", "N", 50.0, 30.0, 300.0, "log")
+    model = carriage()
+    model = replace(model, parameters=(*model.parameters, highest), stepper=runge_kutta_4(limited))
+    found = diagnosed(model, carriage_plant(np.clip(PUSH, -8.0, 8.0), PERIOD)[:, 0], seed=15)
+    assert suspected(found) == {"highest", "input_saturation"}, str(found)
+    assert found.fit.parameters["highest"] * (1.0 + found.extended.parameters["highest.error"]) == pytest.approx(
+        8.0, rel=0.01
+    )
+    silent = diagnosed(model, carriage_plant(PUSH, PERIOD)[:, 0], seed=16)
+    assert silent.verdict == "adequate", str(silent)
 
 
 @of_a_carriage

@@ -23,7 +23,7 @@ from ehsvjax.diagnosis.results.extension import as_fit
 from ehsvjax.diagnosis.results.gain import gain_of
 from ehsvjax.diagnosis.results.misfit import misfit_of
 from ehsvjax.diagnosis.results.suspects import excluded_by, table_of, unseen_by
-from ehsvjax.doubts import turned_around
+from ehsvjax.doubts import mistaken_columns
 from ehsvjax.draws import check_key
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
@@ -66,8 +66,8 @@ def diagnose(
 
     Raises:
         ValueError: for what is no fit, no record or no key, a record that lacks an input, has no output or is short,
-            an output or an input of the wrong sign, an effect of yours that fits no signal of the model, or one that is
-            in the bank twice.
+            columns of which another sign, unit or order explains what the fit does not, an effect of yours that fits no
+            signal of the model, or one that is in the bank twice.
 
     """
     bank = _check_bank(BANK if bank is None else bank)
@@ -164,15 +164,17 @@ def _check(fit, records, validation, key, progress) -> None:
     stack_records(fit.model, records)
 
 
-def _check_signs(bench: Workbench, simulated: Float[np.ndarray, "record time signal"]) -> None:
-    """Refuse records of which a column has the wrong sign: whatever were found would stand for that."""
+def _check_columns(bench: Workbench, simulated: Float[np.ndarray, "record time signal"]) -> None:
+    """Refuse records of which a column is mistaken: whatever were found would stand for that."""
     for k, record in enumerate(bench.records):
         for i, name in enumerate(bench.problem.observed):
-            if name in record.outputs and turned_around(record.outputs[name], simulated[k, : len(record), i]):
-                raise ValueError(
-                    f"expected {name} of {record.name} to run as it is simulated, and it runs the other way: give the "
-                    f"opposite sign to {name}, or to {', '.join(bench.fit.model.inputs)}, Column(..., scale=-1.0)"
-                )
+            if name in record.outputs:
+                found = mistaken_columns(bench.fit, record, name, simulated[k, : len(record), i])
+                if found:
+                    raise ValueError(
+                        f"expected a record of which the fit explains something, got {record.name}, of whose {name} it "
+                        f"explains nothing; {found}: see to its columns, Column(..., scale=...), and identify again"
+                    )
 
 
 def _check_bank(bank) -> tuple[Effect, ...]:
@@ -197,6 +199,6 @@ def _without_spikes(bench: Workbench) -> tuple[Workbench, Bool[np.ndarray, "reco
     """Return the bench without readings that stand alone, and where they are."""
     samples = bench.problem.samples
     simulated = bench.simulated(bench.nominal[None])[0]
-    _check_signs(bench, simulated)
+    _check_columns(bench, simulated)
     alone = spikes(samples.outputs - simulated, samples.measured, samples.outputs)
     return with_readings(bench, samples.measured & ~alone), alone

@@ -4,13 +4,23 @@ import functools
 import math
 from collections.abc import Collection, Sequence
 
-from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, input_named, off_by_error, relative_error
+from ehsvjax.effects.effect import (
+    CHANGE,
+    Effect,
+    EffectParameter,
+    amplitude,
+    input_named,
+    off_by_error,
+    relative_error,
+)
 from ehsvjax.models.model import Model
 
 _FEEDTHROUGH = "feedthrough_of_"
+# Shares by which an idle parameter may be off, in half decades.
+_ERRORS_TRIED = tuple(10.0 ** (k / 2) - 1.0 for k in (-4, -3, -2, -1, 1, 2, 3, 4))
 
 
-def effects_for(model: Model, held: Collection[str] = ()) -> tuple[Effect, ...]:
+def effects_for(model: Model, held: Collection[str] = (), idle: Collection[str] = ()) -> tuple[Effect, ...]:
     """Return the candidate causes that no bank can hold, as their names are the model's.
 
     A constant of zero that is a signal of the diagram too has the effects of that signal's kind.
@@ -18,6 +28,7 @@ def effects_for(model: Model, held: Collection[str] = ()) -> tuple[Effect, ...]:
     Args:
         model: the model.
         held: free parameters that their bounds hold: what a bound says may be as wrong as a constant.
+        idle: free parameters that change nothing between their bounds, and may do so beyond them.
 
     """
     signals = {s.name for s in model.signals}
@@ -25,6 +36,7 @@ def effects_for(model: Model, held: Collection[str] = ()) -> tuple[Effect, ...]:
     return (
         *(_off(p.name) if p.value else _there(p.name) for p in constants if p.value or p.name not in signals),
         *(_off(name) for name in held),
+        *(_off(name, idle=True) for name in idle),
         *(_feedthrough(name) for name in model.inputs),
     )
 
@@ -66,12 +78,16 @@ def _feedthrough(name: str) -> Effect:
 
 
 @functools.cache
-def _off(name: str) -> Effect:
-    """Return the effect of a constant that is off by a share of what was given, the same object for the same name."""
+def _off(name: str, idle: bool = False) -> Effect:
+    """Return the effect of a constant that is off by a share of what was given, the same object for the same name.
+
+    Of what is idle no small error shows what a large one would do.
+    """
+    error = relative_error(usual=math.inf)
     return Effect(
         name,
         "constant",
-        (relative_error(usual=math.inf),),
+        (error._replace(tries=lambda scales: _ERRORS_TRIED) if idle else error,),
         off_by_error,
         says="a constant of the model is another than was given",
         settled_by=_settled_by(name),

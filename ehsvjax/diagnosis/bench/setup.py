@@ -1,12 +1,13 @@
 """How a workbench is set up: which effects are tried at which signals, between which bounds, with which steps."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.workbench import ROUNDING, Workbench, duration_of
+from ehsvjax.doubts import NO_CHANGE
 from ehsvjax.effects.effect import PROBED, Candidate, Effect, EffectParameter, Scales, candidates, input_named
 from ehsvjax.effects.extended import disturbance, extended
 from ehsvjax.effects.internal import Internal, internal_signals, side_by_side
@@ -15,6 +16,7 @@ from ehsvjax.fit import Fit, at_bounds
 from ehsvjax.models.model import Model, Parameter
 from ehsvjax.population import observed_outputs
 from ehsvjax.record import Record
+from ehsvjax.simulate import simulate
 from ehsvjax.unknowns import problem_of
 
 # Kinds of signals at which a missing term is looked for.
@@ -38,9 +40,27 @@ def workbench(fit: Fit, records: Sequence[Record], bank: Sequence[Effect]) -> Wo
     internal = side_by_side(
         [internal_signals(fit.model, r, fit.parameters, start) for r, start in zip(records, initial, strict=True)]
     )
+    idle = _idle(fit, records, initial)
     # How much a force moves depends on the machine: on a larger one a probe of any fixed size is lost in rounding.
-    probes = _calibrated(_bench(fit, records, initial, internal, bank, {}))
-    return _bench(fit, records, initial, internal, bank, probes)
+    probes = _calibrated(_bench(fit, records, initial, internal, bank, idle, {}))
+    return _bench(fit, records, initial, internal, bank, idle, probes)
+
+
+def _idle(fit: Fit, records: Sequence[Record], initial: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return the free parameters that change nothing between their bounds: something beyond them may."""
+
+    def outputs(**changed) -> Iterator[Float[np.ndarray, " time"]]:
+        for record, start in zip(records, initial, strict=True):
+            simulated = simulate(fit.model, record, fit.parameters | changed, start)
+            yield from (simulated[name] / fit.noise_variance[name] ** 0.5 for name in fit.outputs)
+
+    def changes(name: str, value: float) -> bool:
+        moved = zip(outputs(**{name: value}), here, strict=True)
+        return not sum(float(np.sum((there - then) ** 2)) for there, then in moved) < NO_CHANGE
+
+    here = list(outputs())
+    ends = {name: (fit.model.parameter(name).lower, fit.model.parameter(name).upper) for name in fit.model.free}
+    return [name for name, values in ends.items() if fit.parameters[name] and not any(changes(name, v) for v in values)]
 
 
 def _calibrated(bench: Workbench) -> dict[str, float]:
@@ -67,14 +87,15 @@ def _bench(
     initial: Sequence[Mapping[str, float]],
     internal: Internal,
     bank: Sequence[Effect],
+    idle: Sequence[str],
     probes: Mapping[str, float],
 ) -> Workbench:
     """Return the bench before its step is settled, with the probes that are known."""
     model = fit.model
     observed = observed_outputs(model, records)
     # A single record differs from none.
-    held = [name for name, _ in at_bounds(model, fit.parameters) if fit.parameters[name]]
-    own = (*effects_for(model, held), *(differences_for(model) if len(records) > 1 else ()))
+    held = [name for name, _ in at_bounds(model, fit.parameters) if fit.parameters[name] and name not in idle]
+    own = (*effects_for(model, held, idle), *(differences_for(model) if len(records) > 1 else ()))
     found = candidates(model, (*bank, *own), internal.contexts, observed)
     places = tuple(s.name for s in model.signals if s.kind in _PLACES and s.name in internal.values)
     probes = {place: _probe(internal.values[place]) for place in places} | dict(probes)
