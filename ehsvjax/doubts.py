@@ -4,7 +4,7 @@ A simulation that fails is refused (`failure`): there is no fit. A model that ex
 warning, as it may be what the record says; only what was tried and would explain it is named.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,14 +55,10 @@ def about_record(model: Model, record: Record, name: str) -> tuple[float, str]:
     With nominal values: the share of the output's variance that a straight line of the simulated one explains, which
     bears with a gain and an offset but not with another sign, another unit of time or of an input.
     """
-    start = {p.name: p.value for p in model.initial}
-    share, slope, _ = _straight(record.outputs[name], simulate(model, record, model.nominal, start)[name])
-    others = [_Trial(share, f"the opposite sign of {name}, or of {', '.join(model.inputs)},")] if slope < 0 else []
+    nominal = _nominal(model)
+    share, slope, _ = _straight(model, record, name, *nominal)
     share = share if slope > 0 else 0.0
-    for changed, words in _other_records(model, record, name):
-        explained, slope, _ = _straight(changed.outputs[name], simulate(model, changed, model.nominal, start)[name])
-        others += [_Trial(explained, words)] if slope > 0 else []
-    best = max(others, key=lambda trial: round(trial.share, 2), default=_Trial(0.0, ""))
+    best = _best(trial for trial in _trials(model, record, name, *nominal) if trial.columns)
     better = best.share > max(_MOST, share + _BETTER)
     return share, f"{best.words} would explain {best.share:.0%}" if better else ""
 
@@ -116,7 +112,7 @@ def _about_outputs(fit: Fit, residual_variance: Mapping[str, float]) -> tuple[st
             record, start = max(holding, key=lambda pair: np.nanvar(pair[0].outputs[name]))
             found.append(
                 f"{EXPLAINS_NOTHING} {name}: {_fit(share)}, where its mean alone has 0 %; "
-                + _what_would(fit.model, record, fit.parameters, start, name)
+                + _what_would(fit.model, record, name, fit.parameters, start)
             )
     return tuple(found)
 
@@ -217,12 +213,12 @@ def mistaken_columns(fit: Fit, record: Record, name: str, simulated: Float[np.nd
     measured = record.outputs[name]
     if np.nanmean((measured - simulated) ** 2) < (1.0 - _NOTHING) * np.nanvar(measured):
         return ""
-    best = _best(fit.model, record, fit.parameters, fit.initial_of(record), name)
+    best = _best_of_fit(fit.model, record, name, fit.parameters, fit.initial_of(record))
     return f"{best.words} would give {_fit(best.share)}" if best.columns and best.share > _MOST else ""
 
 
-def _what_would(model: Model, record: Record, parameters, start, name: str) -> str:
-    best = _best(model, record, parameters, start, name)
+def _what_would(model: Model, record: Record, name: str, parameters, start) -> str:
+    best = _best_of_fit(model, record, name, parameters, start)
     if best.share > _MOST:
         return f"{best.words} would give {_fit(best.share)}"
     return (
@@ -231,30 +227,37 @@ def _what_would(model: Model, record: Record, parameters, start, name: str) -> s
     )
 
 
-def _best(model: Model, record: Record, parameters, start, name: str) -> _Trial:
-    trials = _trials(model, record, parameters, start, name)
+def _best_of_fit(model: Model, record: Record, name: str, parameters, start) -> _Trial:
+    """Return the single change that explains most of an output, with the fitted or with the nominal values."""
+    values = (parameters, start), _nominal(model)
+    return _best(trial for some in values for trial in _trials(model, record, name, *some))
+
+
+def _best(trials: Iterable[_Trial]) -> _Trial:
     return max(trials, key=lambda trial: round(trial.share, 2), default=_Trial(0.0, ""))
 
 
-def _trials(model: Model, record: Record, parameters, start, name: str) -> Iterator[_Trial]:
-    """Yield single changes of sign, unit or offset, with the fitted and with the nominal values."""
+def _nominal(model: Model) -> tuple[Mapping[str, float], Mapping[str, float]]:
+    return model.nominal, {p.name: p.value for p in model.initial}
+
+
+def _trials(model: Model, record: Record, name: str, parameters, start) -> Iterator[_Trial]:
+    """Yield single changes of sign, unit, order or offset."""
     unit, inputs = model.unit(name), ", ".join(model.inputs)
-    nominal = model.nominal, {p.name: p.value for p in model.initial}
-    for values, initial in ((parameters, start), nominal):
-        if grid_of(model, record).substeps <= _STEPS:
-            share, slope, offset = _straight(record.outputs[name], simulate(model, record, values, initial)[name])
-            if slope < 0:
-                yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
-            elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
-                words = f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})"
-                yield _Trial(share, words, columns=False)
-            else:
-                words = f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
-                yield _Trial(share, words, columns=False)
-        for changed, words in _other_records(model, record, name):
-            share, slope, _ = _straight(changed.outputs[name], simulate(model, changed, values, initial)[name])
-            if slope > 0:
-                yield _Trial(share, words)
+    if grid_of(model, record).substeps <= _STEPS:
+        share, slope, offset = _straight(model, record, name, parameters, start)
+        if slope < 0:
+            yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
+        elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
+            words = f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})"
+            yield _Trial(share, words, columns=False)
+        else:
+            words = f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
+            yield _Trial(share, words, columns=False)
+    for changed, words in _other_records(model, record, name):
+        share, slope, _ = _straight(model, changed, name, parameters, start)
+        if slope > 0:
+            yield _Trial(share, words)
 
 
 def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Record, str]]:
@@ -265,7 +268,7 @@ def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Re
     yield replace(record, time=1e-3 * record.time), "a thousandth of the time (is it in ms?)"
     for given in model.inputs if grid_of(model, record).substeps <= _STEPS else ():
         values, measured = record.inputs[given], record.outputs[name]
-        if np.isfinite(measured).all():
+        if np.isfinite(measured).all() and np.ptp(values) > 0.0:
             exchanged = {**record.inputs, given: measured}, {**record.outputs, name: values}
             yield replace(record, inputs=exchanged[0], outputs=exchanged[1]), f"{given} and {name} exchanged"
         yield replace(record, inputs={**record.inputs, given: -values}), f"the opposite sign of {given}, or of {name},"
@@ -274,10 +277,11 @@ def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Re
             yield changed, f"{factor:.3g} times {given} (mind the unit of its column)"
 
 
-def _straight(measured, simulated) -> tuple[float, float, float]:
-    """Return the share of the variance that a straight line of the simulated output explains, its slope and offset."""
-    kept = np.isfinite(measured)
-    y, x = measured[kept], np.asarray(simulated)[kept]
+def _straight(model: Model, record: Record, name: str, parameters, start) -> tuple[float, float, float]:
+    """Return the share of an output's variance that a line of the simulated one explains, its slope and offset."""
+    simulated = simulate(model, record, parameters, start)[name]
+    kept = np.isfinite(record.outputs[name])
+    y, x = record.outputs[name][kept], simulated[kept]
     spread = float(np.var(x)) if np.isfinite(x).all() else 0.0
     if not 0.0 < spread < np.inf:
         return 0.0, 0.0, float(np.mean(y))

@@ -69,8 +69,9 @@ def test_a_model_that_explains_nothing_says_so_first_and_what_would(record, word
         (_record(LEVEL + 40.0), ""),
         (_record(LEVEL + 0.01 * NOISE), ""),
         (_record(NOISE), ""),
+        (_record(np.sin(0.8 * TIME), np.full(len(TIME), 0.5)), ""),
     ],
-    ids=["sign", "exchanged", "size of the output", "zero of the output", "sound", "noise"],
+    ids=["sign", "exchanged", "size of the output", "zero of the output", "sound", "noise", "a constant input"],
 )
 def test_a_mistake_in_the_columns_is_told_from_what_a_sensor_may_have(record, words):
     fit = _identified(record, initial="nominal")
