@@ -124,6 +124,7 @@ def tried(trials: list[Trial]) -> list[dict[str, Any]]:
 SAID: dict[str, Callable[[str], bool]] = {
     "sign": lambda words: "opposite sign" in words,
     "unit": lambda words: "unit" in words and "would give fit" in words,
+    "constant": lambda words: "mind the unit" in words,
 }
 
 

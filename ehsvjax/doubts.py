@@ -274,7 +274,7 @@ def _other_records(model: Model, record: Record, name: str) -> Iterator[tuple[Re
         yield replace(record, inputs={**record.inputs, given: -values}), f"the opposite sign of {given}, or of {name},"
         for factor in _UNITS:
             changed = replace(record, inputs={**record.inputs, given: factor * values})
-            yield changed, f"{factor:.3g} times {given} (mind the unit of its column)"
+            yield changed, f"{factor:.4g} times {given} (mind the unit of its column)"
 
 
 def _straight(model: Model, record: Record, name: str, parameters, start) -> tuple[float, float, float]:
