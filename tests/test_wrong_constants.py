@@ -148,6 +148,7 @@ def test_a_parameter_that_acts_beyond_its_bounds_only_is_found():
     assert found.fit.parameters["highest"] * (1.0 + found.extended.parameters["highest.error"]) == pytest.approx(
         8.0, rel=0.01
     )
+    assert "N where it changes nothing" in str(found)
     silent = diagnosed(model, carriage_plant(PUSH, PERIOD)[:, 0], seed=16)
     assert silent.verdict == "adequate", str(silent)
 

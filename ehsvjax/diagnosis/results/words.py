@@ -9,7 +9,7 @@ from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, Size, how_sure
-from ehsvjax.fit import EXPLAINS_NOTHING
+from ehsvjax.fit import EXPLAINS_NOTHING, at_bounds
 from ehsvjax.models.model import Parameter
 from ehsvjax.quantities import quantity
 
@@ -256,7 +256,10 @@ def _given(diagnosis: "Diagnosis", cause: Cause) -> str:
         return ""
     given, value, error = own
     there, before = quantity(value, given.unit, error, 4), quantity(given.value, given.unit, digits=4)
-    where = "at which its bound holds it" if given.name in diagnosis.fit.model.free else "that was given"
+    fit, where = diagnosis.fit, "that was given"
+    if given.name in fit.model.free:
+        held = given.name in dict(at_bounds(fit.model, fit.parameters))
+        where = "at which its bound holds it" if held else "where it changes nothing"
     return f"{cause.name}: {there}{_or_beyond(cause.sizes[0])} instead of the {before} {where}"
 
 
