@@ -6,7 +6,7 @@ warning, as it may be what the record says; only what was tried and would explai
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -58,7 +58,7 @@ def about_record(model: Model, record: Record, name: str) -> tuple[float, str]:
     nominal = _nominal(model)
     share, slope, _ = _straight(model, record, name, *nominal)
     share = share if slope > 0 else 0.0
-    best = _best(trial for trial in _trials(model, record, name, *nominal) if trial.columns)
+    best = _best(trial for trial in _trials(model, record, name, *nominal) if trial.mistaken)
     better = best.share > max(_MOST, share + _BETTER)
     return share, f"{best.words} would explain {best.share:.0%}" if better else ""
 
@@ -190,31 +190,39 @@ def _fit(share: float) -> str:
 
 
 class _Trial(NamedTuple):
-    """What would explain an output, in words, the share of its variance that it would, and whether columns are wrong.
+    """What would explain an output, in words, the share of its variance that it would, and whose column is mistaken.
 
-    An output's size and zero are no such mistakes: its sensor may have them.
+    An output's size and zero are no mistakes: its sensor may have them.
     """
 
     share: float
     words: str
-    columns: bool = True
+    mistaken: Literal["inputs", "output", ""] = "inputs"
 
 
-def mistaken_columns(fit: Fit, record: Record, name: str, simulated: Float[np.ndarray, " time"]) -> str:
-    """Return which mistake in the columns would explain an output of which the fit explains nothing, "" if none would.
+def mistaken_columns(fit: Fit, record: Record, simulated: Mapping[str, Float[np.ndarray, " time"]]) -> str:
+    """Return which mistake in a record's columns would explain what the fit does not, "" if there is none.
+
+    Where an output is explained the inputs are as they should be, and another can be mistaken in its own column only.
 
     Args:
         fit: of the model.
-        record: that holds the output.
-        name: of the output.
-        simulated: what the fit makes of it.
+        record: with outputs that were fitted.
+        simulated: name -> what the fit makes of them.
 
     """
-    measured = record.outputs[name]
-    if np.nanmean((measured - simulated) ** 2) < (1.0 - _NOTHING) * np.nanvar(measured):
-        return ""
-    best = _best_of_fit(fit.model, record, name, fit.parameters, fit.initial_of(record))
-    return f"{best.words} would give {_fit(best.share)}" if best.columns and best.share > _MOST else ""
+    unexplained = []
+    for name, readings in record.outputs.items():
+        kept = np.isfinite(readings)
+        left = np.mean((readings - simulated[name])[kept] ** 2)
+        if not left < (1.0 - _NOTHING) * np.var(readings[kept]):
+            unexplained.append(name)
+    able = ("inputs", "output") if len(unexplained) == len(record.outputs) else ("output",)
+    for name in unexplained:
+        best = _best_of_fit(fit.model, record, name, fit.parameters, fit.initial_of(record))
+        if best.share > _MOST and best.mistaken in able:
+            return f"the fit explains nothing of {name}, and {best.words} would give {_fit(best.share)}"
+    return ""
 
 
 def _what_would(model: Model, record: Record, name: str, parameters, start) -> str:
@@ -247,13 +255,13 @@ def _trials(model: Model, record: Record, name: str, parameters, start) -> Itera
     if grid_of(model, record).substeps <= _STEPS:
         share, slope, offset = _straight(model, record, name, parameters, start)
         if slope < 0:
-            yield _Trial(share, f"the opposite sign of {name}, or of {inputs},")
+            yield _Trial(share, f"the opposite sign of {name}, or of {inputs},", mistaken="output")
         elif slope > 0 and not 1.0 / _OTHER_UNIT < slope < _OTHER_UNIT:
             words = f"a simulated {name} {slope:.2g} times as large (its unit, or that of {inputs})"
-            yield _Trial(share, words, columns=False)
+            yield _Trial(share, words, mistaken="")
         else:
             words = f"{name} less {offset:.3g} {unit}".rstrip() + " (its zero: Column(..., offset=...))"
-            yield _Trial(share, words, columns=False)
+            yield _Trial(share, words, mistaken="")
     for changed, words in _other_records(model, record, name):
         share, slope, _ = _straight(model, changed, name, parameters, start)
         if slope > 0:

@@ -11,6 +11,7 @@ import ehsvjax
 from ehsvjax import doubts
 from ehsvjax.unknowns import problem_of
 from tests import plants
+from tests.small_models import carriage
 from tests.test_failure import GROWTH
 
 PERIOD = 0.05
@@ -75,8 +76,24 @@ def test_a_model_that_explains_nothing_says_so_first_and_what_would(record, word
 )
 def test_a_mistake_in_the_columns_is_told_from_what_a_sensor_may_have(record, words):
     fit = _identified(record, initial="nominal")
-    found = doubts.mistaken_columns(fit, record, "level", fit.simulate(record)["level"])
-    assert found.startswith(words) and bool(found) == bool(words)
+    found = doubts.mistaken_columns(fit, record, fit.simulate(record))
+    assert words in found and bool(found) == bool(words)
+
+
+def test_where_an_output_is_explained_the_inputs_are_no_mistake():
+    model, push = carriage(), plants.held_levels(5, 20.0, 20, 20)
+    there = ehsvjax.Record(0.02 * np.arange(len(push)), {"push": push})
+    position, velocity = ehsvjax.simulate(model, there).values()
+    at_once = ehsvjax.simulate(model, replace(there, time=1e-3 * there.time))["velocity"]
+    for outputs, words in (
+        ({"position": position, "velocity": 1e3 * at_once}, ""),
+        ({"velocity": 1e3 * at_once}, "nothing of velocity, and a thousandth of the time"),
+        ({"position": position, "velocity": -velocity}, "nothing of velocity, and the opposite sign of velocity"),
+    ):
+        record = replace(there, outputs=outputs)
+        fit = _identified(record, model, initial="nominal")
+        found = doubts.mistaken_columns(fit, record, fit.simulate(record))
+        assert words in found and bool(found) == bool(words), outputs.keys()
 
 
 def test_what_nothing_explains_is_not_explained():

@@ -166,15 +166,13 @@ def _check(fit, records, validation, key, progress) -> None:
 
 def _check_columns(bench: Workbench, simulated: Float[np.ndarray, "record time signal"]) -> None:
     """Refuse records of which a column is mistaken: whatever were found would stand for that."""
-    for k, record in enumerate(bench.records):
-        for i, name in enumerate(bench.problem.observed):
-            if name in record.outputs:
-                found = mistaken_columns(bench.fit, record, name, simulated[k, : len(record), i])
-                if found:
-                    raise ValueError(
-                        f"expected a record of which the fit explains something, got {record.name}, of whose {name} it "
-                        f"explains nothing; {found}: see to its columns, Column(..., scale=...), and identify again"
-                    )
+    for record, outputs in zip(bench.records, simulated, strict=True):
+        named = dict(zip(bench.problem.observed, outputs[: len(record)].T, strict=True))
+        if found := mistaken_columns(bench.fit, record, named):
+            raise ValueError(
+                f"expected columns of {record.name} as the model means them: {found}; see to Column(..., scale=...), "
+                "and identify again"
+            )
 
 
 def _check_bank(bank) -> tuple[Effect, ...]:
