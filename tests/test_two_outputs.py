@@ -89,3 +89,19 @@ def test_oil_is_found_at_the_frequency_at_which_it_rings():
     found = diagnose(fit, record, key=KEY, bank=some)
     assert found.names == ("oil_compressibility",), str(found)
     assert found.causes[0].sizes[0].value == pytest.approx(capacitance, rel=0.05)
+
+
+def test_a_stop_far_stiffer_than_the_machine_is_a_stop():
+    # Held to 200 times what the machine itself seemed to be, it was "unexplained", or a stop, an area and a gain.
+    seed = 235189949
+    command = held_levels([5, seed], 6e-3, 25, 200)[:2000]
+    hidden = {"end_stop": {"position": 0.036, "stiffness": 6e7}}
+    clean = servovalve_with([hidden], command[None], 1e-3, fine_step=1e-5)
+    rng = np.random.default_rng([10, seed])
+    noisy = {name: clean[name][0] + NOISE[name] * rng.standard_normal(len(command)) for name in NOISE}
+    record = ehsvjax.Record(1e-3 * np.arange(len(command)), {"command": command}, noisy)
+    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=KEY, population=50, generations=20)
+    found = diagnose(fit, record, key=KEY)
+    assert found.names == ("end_stop",), str(found)
+    assert found.extended.parameters["end_stop.positive_end"] == pytest.approx(0.036, abs=3e-4)
+    assert found.extended.parameters["end_stop.positive_stiffness"] == pytest.approx(6e7, rel=0.3)

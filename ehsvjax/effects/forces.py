@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from ehsvjax.effects.effect import PROBED, UNLIMITED, Effect, EffectParameter, Scales, amplitude, shape, size
 from ehsvjax.effects.hysteresis import elastic_friction
 
-# Stiffness of an end stop over that of the machine: a softer one is a spring, a stiffer one a wall.
-_STOP_STIFFNESS, _SOFTEST, _STIFFEST = (6.0, 18.0, 60.0), 0.1, 200.0
+# Stiffness of an end stop over that of the machine, as it seems where the fit is bad: a softer one is a spring.
+_STOP_STIFFNESS, _SOFTEST, _STIFFEST = (6.0, 18.0, 60.0), 0.1, 1e5
 
 
 def _probe(scales: Scales) -> float:
