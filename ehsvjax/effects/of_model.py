@@ -4,15 +4,7 @@ import functools
 import math
 from collections.abc import Collection, Sequence
 
-from ehsvjax.effects.effect import (
-    CHANGE,
-    Effect,
-    EffectParameter,
-    amplitude,
-    input_named,
-    off_by_error,
-    relative_error,
-)
+from ehsvjax.effects.effect import CHANGE, Effect, EffectParameter, amplitude, input_named, off_by_error, relative_error
 from ehsvjax.models.model import Model
 
 _FEEDTHROUGH = "feedthrough_of_"
