@@ -274,6 +274,10 @@ def _told(records: Sequence[ehsvjax.Record], trial: Trial, key) -> str:
 
 def outcome(trial: Trial, found: Diagnosis) -> str:
     """Judge one diagnosis."""
+    if found.alone and trial.kind == "in the second alone":
+        first, second = found.alone
+        right = trial.name in map(base, (*second.names, *(n for g in second.alternatives for n in g.causes)))
+        return "said, with the record" if right and not first.names else "wrong"
     if found.verdict == "unexplained":
         return found.verdict
     if trial.kind == "none":

@@ -61,7 +61,7 @@ def bent():
 @of_the_oscillator
 def test_records_of_unlike_length_period_and_noise_share_their_cause(bent):
     records, found = bent
-    assert (found.verdict, found.names) == ("named", ("cubic_stiffness",)), str(found)
+    assert (found.verdict, found.names, found.alone) == ("named", ("cubic_stiffness",), ()), str(found)
     error = found.extended.precision().standard_errors["cubic_stiffness.coefficient"]
     assert abs(found.extended.parameters["cubic_stiffness.coefficient"]) == pytest.approx(COEFFICIENT, abs=4 * error)
     assert found.records == tuple(records) and found.extended.records == tuple(records)
@@ -132,6 +132,28 @@ def test_a_periodic_force_has_an_amplitude_of_its_own_in_every_record():
     for record in found.extended.records:
         assert found.extended.score(record).rmse["position"] == pytest.approx(1e-2, rel=0.1)
     assert found.extended.score(records[0]).rmse["position"] > 2e-2
+
+
+@of_the_oscillator
+def test_what_one_record_alone_has_is_named_of_that_record(tmp_path):
+    """Together a parameter that changed, certain, and a random force stood for it."""
+    limited = {"input_saturation": {"limit": 0.6}}
+    records = [
+        oscillation(1, 15, 50, 0.02, 1e-2, "plain"),
+        oscillation(2, 15, 50, 0.02, 1e-2, "limited", **limited),
+    ]
+    found = diagnose(fitted(ehsvjax.van_der_pol(), records), records, key=KEY)
+    assert (found.verdict, found.names, found.alternatives) == ("unexplained", (), ()), str(found)
+    assert [(one.verdict, one.names) for one in found.alone] == [("adequate", ()), ("named", ("input_saturation",))]
+    assert [one.records for one in found.alone] == [(record,) for record in records]
+    assert found.alone[1].extended.parameters["input_saturation.limit"] == pytest.approx(0.6, rel=0.02)
+    said = str(found).splitlines()[0]
+    assert "the records disagree" in said and "plain by itself: adequate; limited by itself: input_saturation (" in said
+    found.report(tmp_path / "page.html")
+    assert "limited by itself: input_saturation" in (tmp_path / "page.html").read_text()
+    found.save(tmp_path / "found.npz")
+    again = Diagnosis.load(tmp_path / "found.npz")
+    assert str(again) == str(found) and str(again.alone[1]) == str(found.alone[1])
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

@@ -14,8 +14,9 @@ from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
 from ehsvjax.diagnosis.decision.examination import Examination, examine
 from ehsvjax.diagnosis.decision.search import select
-from ehsvjax.diagnosis.decision.verdict import verdict_of
+from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
+from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.causes import causes_of
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
 from ehsvjax.diagnosis.results.explanations import explanations_of
@@ -53,7 +54,9 @@ def diagnose(
 
     Several records share the parameters of the model and the causes; each has its own length, sample period, outputs,
     known constants, initial conditions and noise, and of a cause that goes by its clock, a drift or a periodic force,
-    its own amplitudes. Priors of the fit are left aside: the records alone are asked.
+    its own amplitudes. Where they leave something together, each is asked by itself; if that explains every one, they
+    disagree: nothing is named for all, and `alone` has what each says. Priors of the fit are left aside: the records
+    alone are asked.
 
     Args:
         fit: of the model, by `identify`.
@@ -98,10 +101,16 @@ def _diagnosed(
     examined = examine(selection)
     nominal = as_fit(examined.selection, selection.nominal, ())
     wider, gain, verdict = _judged(examined, nominal, validation, rng)
-    if verdict.word == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values()):
+    alone: tuple[Diagnosis, ...] = ()
+    if len(records) > 1 and not _explained(verdict.word, examined.innocent, examined.chance):
+        alone = _each_alone(fit, records, bank, rng, say)
+    worse = verdict.word == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values())
+    if alone or worse:
         # What was added on the way to no explanation does not predict: it is left out again, and all is judged anew.
         examined = examine(selection.without_causes())
         wider, gain, verdict = _judged(examined, nominal, validation, rng)
+    if alone:
+        verdict = UNEXPLAINED
     say("measuring the gain", 0.95)
     selection = examined.selection
     suspected = tuple(dict.fromkeys(name for group in verdict.groups for name in group))
@@ -124,7 +133,26 @@ def _diagnosed(
         fit=fit,
         records=records,
         explanations=explanations_of(selection, verdict),
+        alone=alone,
     )
+
+
+def _explained(word: str, innocent: bool, chance: ProcessNoise | None) -> bool:
+    """Whether nothing is left that the bank may lack; a force that was not seen to be chance may be that."""
+    return word != "unexplained" and innocent and (chance is None or chance.settled)
+
+
+def _each_alone(
+    fit: Fit, records: tuple[Record, ...], bank: tuple[Effect, ...], rng: np.random.Generator, say: Progress
+) -> tuple[Diagnosis, ...]:
+    """Diagnose each record by itself; return nothing if one of them is not explained by itself either."""
+    found: list[Diagnosis] = []
+    for record in records:
+        one = _diagnosed(fit, (record,), (), bank, rng, say)
+        if not _explained(one.verdict, one.innocent, one.process_noise):
+            return ()
+        found.append(one)
+    return tuple(found)
 
 
 def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...], rng: np.random.Generator):

@@ -49,6 +49,10 @@ class Verdict(NamedTuple):
     alternatives: tuple[Alternative, ...]
 
 
+UNEXPLAINED = Verdict("unexplained", (), (), ())
+"""That something is missing, and nothing is named."""
+
+
 def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     """Return the verdict, with the causes and what could be there instead.
 
@@ -64,7 +68,7 @@ def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
         # Where something is left, what predicts nothing may as well stand for what the bank lacks.
         groups = [g if predicted_by[k] else _or_unknown(g) for k, g in zip(order, groups, strict=True)]
     if examined.lacking or not (examined.innocent or groups):
-        return Verdict("unexplained", (), (), ())
+        return UNEXPLAINED
     others = [{name: 1.0} for name in _quantised(selection)]
     others += [_chance(examined.chance)] if examined.chance else []
     included = (*(selection.included[k] for k in order), *(None for _ in others))

@@ -61,6 +61,8 @@ class Diagnosis:
         fit: the fit that was diagnosed.
         records: on which.
         explanations: what these records cannot tell apart, each as a fit: `next_experiment` tells how to.
+        alone: of several records that nothing explains together, what each says by itself, if that explains every one
+            of them: they disagree. None otherwise.
 
     """
 
@@ -82,6 +84,7 @@ class Diagnosis:
     fit: Fit
     records: tuple[Record, ...]
     explanations: tuple[Explanation, ...] = ()
+    alone: tuple["Diagnosis", ...] = ()
 
     @property
     def record(self) -> Record:

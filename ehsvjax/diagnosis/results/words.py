@@ -59,9 +59,18 @@ def verdict(diagnosis: "Diagnosis") -> str:
         return (
             f"ambiguous: {_stated(diagnosis)}: {these(diagnosis)} cannot tell.{_explained(diagnosis)}{_left(diagnosis)}"
         )
+    if diagnosis.alone:
+        each = "; ".join(f"{one.record.name} by itself: {_in_short(one)}" for one in diagnosis.alone)
+        return f"the records disagree. Nothing explains them together, and each by itself is explained. {each}."
     better = "a single term explains the record better than several effects of the bank together"
     why = better if diagnosis.innocent else "no effect of the bank has earned its place"
     return f"unexplained. Something is missing, and {why}.{_or_chance(diagnosis)}"
+
+
+def _in_short(diagnosis: "Diagnosis") -> str:
+    """Return the verdict on a record that is explained, without what was gained."""
+    stated = _stated(diagnosis)
+    return f"ambiguous, {stated}" if diagnosis.verdict == "ambiguous" else stated or diagnosis.verdict
 
 
 def _explained(diagnosis: "Diagnosis") -> str:
@@ -327,7 +336,9 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
     if diagnosis.explanations:
         limits = ", ".join(f"{name}=(least, most)" for name in diagnosis.fit.model.inputs)
         lines.append(f"the record that would tell: .next_experiment(ehsvjax.Limits({limits}), key=key)")
-    if diagnosis.verdict == "unexplained":
+    if diagnosis.alone:
+        lines.append("ask what changed between these records; what each says by itself: .alone")
+    elif diagnosis.verdict == "unexplained":
         lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
     if diagnosis.verdict == "adequate":
         said = "; ".join(f"{e.cause} above {quantity(e.above, e.unit, digits=2)}" for e in diagnosis.excluded[:_NAMED])
