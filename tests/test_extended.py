@@ -92,3 +92,17 @@ def test_a_force_that_depends_on_time_is_right_to_second_order_of_the_step():
     truth = solve_ivp(rates, (0.0, record.time[-1]), (0.0, 0.0), t_eval=record.time, rtol=1e-10, atol=1e-12).y[0]
     # Held from the start of each step it would be late by half a step: 0.06 rad.
     assert np.max(np.abs(found - truth)) < 3e-3 * np.max(np.abs(truth))
+
+
+def test_a_sensor_that_lags_is_shown_what_a_further_extension_knows_of_the_inputs():
+    # The fit that a diagnosis extended by a lag could not be diagnosed.
+    count, period, push, gain = 200, 0.02, 3.0, 1e-3
+    record = ehsvjax.Record(period * np.arange(count), {"push": np.full(count, push)})
+    duration = count * period
+    lagging = attach(carriage(), {"sensor_lag@position.time_constant": (0.0, 1.0)}, duration=duration, bank=BANK)
+    both = attach(lagging, {"feedthrough_of_push@position.gain": (-1.0, 1.0)}, duration=duration, bank=BANK)
+    lag = {"sensor_lag@position.time_constant": 0.1}
+    shown = ehsvjax.simulate(both, record, lag | {"feedthrough_of_push@position.gain": gain})["position"]
+    without = ehsvjax.simulate(lagging, record, lag)["position"]
+    # A lag of what is constant is what it is, once it has settled.
+    np.testing.assert_allclose((shown - without)[-50:], gain * push, rtol=1e-9)

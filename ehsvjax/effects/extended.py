@@ -207,7 +207,8 @@ def _equations(base: Equations, attached: tuple[Candidate, ...], places: tuple[s
             added = added_by(series(0.0)) if places else {}
             # What depends on time is held over the step: at its middle that is right to second order.
             middle = (state.steps + 0.5) * step_size
-            current[0] = _Moment(middle, step_size, state.memories, inside, added)
+            # A model that was extended before shows its sensors' memories their outputs within the step.
+            current[0] = _Moment(middle, step_size, state.memories, inside, added, series(0.5))
             now = drifted(parameters, middle)
             once = base.stepper(now, step_size, disturbed) if steady is None else steady
             following = once(state.state, series)
