@@ -14,7 +14,7 @@ from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
 from ehsvjax.diagnosis.decision.examination import Examination, examine
 from ehsvjax.diagnosis.decision.search import select
-from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, verdict_of
+from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, Verdict, verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.causes import causes_of
@@ -54,8 +54,8 @@ def diagnose(
 
     Several records share the parameters of the model and the causes; each has its own length, sample period, outputs,
     known constants, initial conditions and noise, and of a cause that goes by its clock, a drift or a periodic force,
-    its own amplitudes. Where they leave something together, each is asked by itself; if that explains every one, they
-    disagree: nothing is named for all, and `alone` has what each says. Priors of the fit are left aside: the records
+    its own amplitudes. Where they leave something together, each is asked by itself; if that explains every one,
+    `alone` has what each says, and only what all of them say is named. Priors of the fit are left aside: the records
     alone are asked.
 
     Args:
@@ -104,12 +104,14 @@ def _diagnosed(
     alone: tuple[Diagnosis, ...] = ()
     if len(records) > 1 and not _explained(verdict.word, examined.innocent, examined.chance):
         alone = _each_alone(fit, records, bank, rng, say)
+    disagree = bool(alone) and not _confirmed(verdict, alone)
     worse = verdict.word == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values())
-    if alone or worse:
-        # What was added on the way to no explanation does not predict: it is left out again, and all is judged anew.
+    if disagree or worse:
+        # What was added on the way to no explanation does not predict, or stands for what single records have: it is
+        # left out again, and all is judged anew.
         examined = examine(selection.without_causes())
         wider, gain, verdict = _judged(examined, nominal, validation, rng)
-    if alone:
+    if disagree:
         verdict = UNEXPLAINED
     say("measuring the gain", 0.95)
     selection = examined.selection
@@ -128,7 +130,7 @@ def _diagnosed(
         innocent=examined.innocent,
         undecided=examined.undecided,
         missing=examined.missing,
-        process_noise=examined.chance,
+        process_noise=None if disagree else examined.chance,
         integration=selection.integration,
         fit=fit,
         records=records,
@@ -153,6 +155,12 @@ def _each_alone(
             return ()
         found.append(one)
     return tuple(found)
+
+
+def _confirmed(verdict: Verdict, alone: Sequence[Diagnosis]) -> bool:
+    """Whether each record by itself has every cause that all share, or what could be there instead."""
+    suspected = [{*one.names, *(name for group in one.alternatives for name in group.causes)} for one in alone]
+    return bool(verdict.groups) and all(names & set(group) for names in suspected for group in verdict.groups)
 
 
 def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...], rng: np.random.Generator):

@@ -61,8 +61,8 @@ class Diagnosis:
         fit: the fit that was diagnosed.
         records: on which.
         explanations: what these records cannot tell apart, each as a fit: `next_experiment` tells how to.
-        alone: of several records that nothing explains together, what each says by itself, if that explains every one
-            of them: they disagree. None otherwise.
+        alone: of several records that leave something together, what each says by itself, if that explains every one of
+            them. Where they do not all say what was found together, they disagree, and that is not named.
 
     """
 
