@@ -276,7 +276,7 @@ def outcome(trial: Trial, found: Diagnosis) -> str:
     """Judge one diagnosis."""
     if found.alone and trial.kind == "in the second alone":
         first, second = found.alone
-        right = trial.name in map(base, (*second.names, *(n for g in second.alternatives for n in g.causes)))
+        right = trial.name in map(base, second.suspected)
         return "said, with the record" if right and not first.names else "wrong"
     if found.verdict == "unexplained":
         return found.verdict

@@ -159,8 +159,7 @@ def _each_alone(
 
 def _confirmed(verdict: Verdict, alone: Sequence[Diagnosis]) -> bool:
     """Whether each record by itself has every cause that all share, or what could be there instead."""
-    suspected = [{*one.names, *(name for group in one.alternatives for name in group.causes)} for one in alone]
-    return bool(verdict.groups) and all(names & set(group) for names in suspected for group in verdict.groups)
+    return bool(verdict.groups) and all(one.suspected & set(group) for one in alone for group in verdict.groups)
 
 
 def _judged(examined: Examination, nominal: Fit, validation: tuple[Record, ...], rng: np.random.Generator):

@@ -97,6 +97,11 @@ class Diagnosis:
         return tuple(cause.name for cause in self.causes)
 
     @property
+    def suspected(self) -> set[str]:
+        """Names of the causes, and of all that could be there instead."""
+        return {*self.names, *(name for group in self.alternatives for name in group.causes)}
+
+    @property
     def left(self) -> Left:
         """What no cause explains: how much of it, where it shows, along what; see `missing` for its form."""
         test = None if self.innocent or not self.misfit.tests_after else self.misfit.tests_after[0]

@@ -144,7 +144,7 @@ def _draw_suspects(axes, diagnosis: Diagnosis) -> None:
     table = diagnosis.table
     table = table[np.isfinite(table["score"].astype(float))].drop_duplicates("cause").head(_SUSPECTS)
     table = table.sort_values("score", key=lambda scores: scores.astype(float).abs())
-    within = {name for a in diagnosis.alternatives for name in a.causes} | set(diagnosis.names)
+    within = diagnosis.suspected
     colours = [MODEL if cause in within else MEASURED for cause in table["cause"]]
     scores = table["score"].astype(float).abs()
     axes.barh(range(len(table)), scores, color=colours)
