@@ -1,6 +1,7 @@
 """The order of the search for causes: what is looked for beside what, with sets of names in the place of refits."""
 
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import pytest
 
@@ -79,6 +80,43 @@ def test_a_search_that_goes_round_ends(searched):
     found, _ = searched({frozenset(): "a0", **{frozenset({f"a{k}"}): "b" for k in range(1, 50)}}, swaps | {
         frozenset({f"a{k}", "b"}): ((f"a{k + 1}", "b"), "b") for k in range(1, 50)})  # fmt: skip
     assert len(found) == 1
+
+
+def test_rivals_of_which_each_is_better_under_the_noise_of_the_other_are_looked_at_once(monkeypatch, unchecked):
+    """Where nothing explains the records many are as bad, and to look at each again takes most of a diagnosis."""
+    looked = []
+    bench = SimpleNamespace()
+
+    class Looked(NamedTuple):
+        trials: object
+        included: tuple
+        current: object
+        noise: object
+
+    def look(trials, included, current, noise):
+        looked.append(included)
+        return Looked(trials, included, current, noise)
+
+    def swapped(trials, included, current, *_):
+        return ("b",) if included == ("a",) else ("a",), current, ()
+
+    for name, stub in {
+        "_from_nominal_starts_too": lambda stage: stage.current,
+        "refit_set": lambda trials, start, included, noise: SimpleNamespace(points=[None]),
+        "rivals_of_all": swapped,
+        "rivals_again": swapped,
+        "_compared": lambda final, nominal, rivals: [],
+        "_settled_for_all": lambda bench, compared, noise: (bench, 0.0),
+        "_look": look,
+        "_needs": lambda stage, nominal: ((), None),
+        "_needless": lambda included, needs, unused: None,
+    }.items():
+        monkeypatch.setattr(search, name, stub)
+    trials = SimpleNamespace(bench=bench)
+    trials._replace = lambda bench: trials
+    weighed = search._weighed(Looked(trials, ("a",), None, None), SimpleNamespace(points=[None]))
+    assert looked == [("b",)]
+    assert weighed.stage.included == ("a",)
 
 
 @pytest.mark.parametrize(("gained", "chosen"), [(5.0, "dead zone"), (-50.0, "dead zone"), (50.0, "change of gain")])

@@ -215,7 +215,7 @@ class _Weighed(NamedTuple):
 
 def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
-    looked_at = set(stage.included)
+    looked_at = {frozenset(stage.included)}
     final = _from_nominal_starts_too(stage)
     included, final, rivals = rivals_of_all(stage.trials, stage.included, final, stage.noise)
     for rounds_left in reversed(range(_ROUNDS)):
@@ -223,11 +223,12 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
         trials, noise = stage.trials, stage.noise
         nominal = refit_set(trials, nominal.points[0], (), noise)
         known, worth = _settled_for_all(trials.bench, _compared(final, nominal, rivals), noise)
-        if not rounds_left or (known is trials.bench and set(included) == looked_at):
+        # Of two that are as good each may be the better one beside the noise that the other leaves.
+        if not rounds_left or (known is trials.bench and frozenset(included) in looked_at):
             break
         # Nothing is searched again: what was found is refitted from where it is, under the noise that is left now.
         stage = _look(trials._replace(bench=known), included, final, noise)
-        looked_at = set(included)
+        looked_at.add(frozenset(included))
         included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
     needs, unused = _needs(stage, nominal)
     return _Weighed(stage, nominal, rivals, needs, unused, _needless(included, needs, unused), worth)
