@@ -4,9 +4,10 @@
 
 A servovalve of tests/hidden_plants.py hides one effect of random size; its record is diagnosed. Where the diagnosis
 cannot tell what it is, the next experiment is planned from the diagnosis alone, the plant runs it, and both records are
-diagnosed together. The table says how often the effect was then named, how far the two explanations really came apart
-against what the plan said, how often they were told apart against its probability, how much further than by simple
-choices, how the errors of the parameters came out, and whether the plant kept the limits.
+diagnosed together. Whether any experiment can tell says an exhaustive search in the plant (benchmarks/exhaustive.py).
+The table says how often the effect was then named, how far the two explanations really came apart against what the plan
+said, how often they were told apart against its probability, how much further than by simple choices, how the errors of
+the parameters came out, and whether the plant kept the limits.
 """
 
 import argparse
@@ -23,6 +24,7 @@ import numpy as np
 import pandas as pd
 
 import ehsvjax
+from benchmarks.exhaustive import Question, Rig, best
 from benchmarks.processes import rows_of, said
 from ehsvjax import excitation as excitation_of
 from ehsvjax.diagnosis import Diagnosis
@@ -30,11 +32,13 @@ from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.experiment import Plan
 from ehsvjax.experiment.plan import told_apart
 from ehsvjax.experiment.separation import as_said, as_said_so_far, refitted_cost
+from tests.hidden_oracle import SEPARABLE
 from tests.hidden_plants import SERVOVALVE_EFFECTS, Valve, servovalve_with
-from tests.hidden_records import Hidden, excitation, noise_of, sizes_of
+from tests.hidden_records import EXCITATIONS, Hidden, excitation, noise_of, sizes_of
 
 LIMITS = ehsvjax.Limits(command=(-8e-3, 8e-3), position=(-0.2, 0.2))
 SUPPLY = (70e5, 210e5)
+RIG = Rig(LIMITS.between["command"][1], (SUPPLY[0], Valve().supply_pressure, SUPPLY[1]), LIMITS.between["position"])
 PRESSURE_NOISE = 2.5e9
 VARIANCES = (1e-8, 1e-7, 1e-6)
 # Steps of the plant in which a load pressure is known to a few readings; the position needs none so short.
@@ -78,12 +82,17 @@ def _loop(trial: Trial) -> dict[str, Any]:
     hidden = Hidden("servovalve", "white", trial.variance, (trial.name,), trial.seed)
     rng = np.random.default_rng(trial.seed)
     sizes = sizes_of(hidden, rng)
-    command, period = excitation("servovalve", int(rng.integers(3)))
+    seed = int(rng.integers(EXCITATIONS))
+    command, period = excitation("servovalve", seed)
     first, _ = _run(hidden, sizes, ehsvjax.Record(period * np.arange(len(command)), {"command": command}), (), rng)
     key = jax.random.key(trial.seed)
     fit = ehsvjax.identify(ehsvjax.servovalve(), first, key=key, population=50, generations=20)
     found = ehsvjax.diagnose(fit, first, key=key, progress=False)
     row = {"first": _answer(found, trial.name), "groups": [a.causes for a in found.alternatives], "sizes": sizes}
+    if row["first"] != "named" and trial.name != "process_noise":
+        variances = {"position": trial.variance} | ({"load_pressure": PRESSURE_NOISE} if trial.add_pressure else {})
+        can = best(Question(trial.name, sizes, seed, RIG, variances))
+        row |= {"can": can.deficit, "rival": can.rival, "by": can.experiment}
     hidden_sizes = {f"{name}.{number}": size for name, own in sizes.items() for number, size in own.items()}
     # Who sees nothing asks what would show it.
     against = hidden_sizes if row["first"] == "not seen" and trial.name != "process_noise" else None
@@ -208,6 +217,9 @@ def main() -> None:
     rows = rows_of(tried, trials_of(options), lambda trial: trial.add_pressure, options.out / "rows.json")
     table = pd.DataFrame(rows)
     print(pd.crosstab(table["first"].fillna("crashed"), table["answer"]).to_string())
+    can = table[table["can"] > SEPARABLE] if "can" in table else table[:0]
+    named = int((can["answer"] == "named").sum())
+    print(f"not named at first, and some experiment can tell: {len(can)}; named then: {named}")
     planned = table[table["said"].notna()] if "said" in table else table[:0]
     if len(planned):
         ratio = planned["came"] / planned["said"]
@@ -233,7 +245,7 @@ def main() -> None:
         print(f"not seen at first: {len(unseen)}; seen then, or said that nothing shows it: {int(shown.sum())}")
         print(f"within the limits: {int(planned['kept'].sum())} of {len(planned)}")
         print(f"seconds a plan: median {planned['seconds'].median():.0f}, at most {planned['seconds'].max():.0f}")
-    columns = ["name", "variance", "first", "answer", "said", "came", "words"]
+    columns = ["name", "variance", "first", "answer", "can", "rival", "said", "came", "words"]
     print(table[[c for c in columns if c in table]].to_string())
 
 
