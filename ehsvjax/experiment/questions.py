@@ -4,11 +4,15 @@ import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 
+from jaxtyping import Array, Key
+
 from ehsvjax.checks import by_name, number
 from ehsvjax.diagnosis.bench.workbench import duration_of
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
+from ehsvjax.diagnosis.results.with_term import with_term
 from ehsvjax.effects import BANK, attach
 from ehsvjax.effects.extended import DURATION
+from ehsvjax.effects.free_form import attachable
 from ehsvjax.experiment.plan import Pair
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
@@ -19,8 +23,10 @@ NOTHING_MORE = "nothing more"
 """The explanation that has no effect of a size that is asked about."""
 
 
-def undecided_of(diagnosis: Diagnosis) -> tuple[dict[str, Fit], list[Pair]]:
+def undecided_of(diagnosis: Diagnosis, key: Key[Array, ""]) -> tuple[dict[str, Fit], list[Pair]]:
     """Return the explanations that a diagnosis cannot tell apart, and the pairs: those of one cause among themselves.
+
+    Where no cause has another in its place and something is missing, the forms that explain it alike.
 
     Raises:
         ValueError: where there are none.
@@ -36,11 +42,25 @@ def undecided_of(diagnosis: Diagnosis) -> tuple[dict[str, Fit], list[Pair]]:
         explanations |= {name: one.fit for name, one in zip(names, likely, strict=True)}
         pairs += itertools.permutations(names, 2)
     if not pairs:
+        explanations = _terms_of(diagnosis, key)
+        pairs = list(itertools.permutations(explanations, 2))
+    if not pairs:
         raise ValueError(
             f"expected a diagnosis with causes that the records cannot tell apart, got {diagnosis.verdict!r} without: "
             "ask about an effect that they may not show, against={'coulomb_friction.force': 50.0}"
         )
     return explanations, pairs
+
+
+def _terms_of(diagnosis: Diagnosis, key: Key[Array, ""]) -> dict[str, Fit]:
+    """Return the forms that a missing term may have, each beside what was found; not those that go by the clock."""
+    missing, plain = diagnosis.missing, diagnosis.extended
+    forms = (missing.form, *missing.alike) if missing is not None and diagnosis.leaves_something else ()
+    attached = {str(form): attachable(form, plain.model) for form in forms}
+    able = {name: term for name, term in attached.items() if term is not None}
+    if len(able) < 2:
+        return {}
+    return {name: with_term(plain, able[name], key) for name in list(able)[:_MOST]}
 
 
 def doubts_of(diagnosis: Diagnosis, against: Mapping[str, float]) -> tuple[dict[str, Fit], list[Pair]]:

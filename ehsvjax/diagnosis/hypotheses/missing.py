@@ -28,6 +28,7 @@ from ehsvjax.diagnosis.hypotheses.curves import (
 )
 from ehsvjax.diagnosis.hypotheses.dependence import Dependence
 from ehsvjax.diagnosis.hypotheses.smoothing import Smooth, of_one_wave, smoothed
+from ehsvjax.effects.free_form import FreeForm
 
 # For each knot of the smooth curve.
 _SAMPLES_PER_KNOT = 50
@@ -63,7 +64,7 @@ class MissingTerm(NamedTuple):
         explained: share of the residual's sum of squares above the noise that it takes.
         pieces: effective number of them, for smooth as it is; a single wave counts as three.
         residual: `[record, time, signal]` what the records are with it, less what is simulated.
-        alike: other places and quantities, by whose curves the record is explained as well, `(place, quantity)`.
+        alike: other terms, at other places or along other quantities, that explain the records as well.
 
     """
 
@@ -80,7 +81,12 @@ class MissingTerm(NamedTuple):
     explained: float
     pieces: float
     residual: Float[np.ndarray, "record time signal"]
-    alike: tuple[tuple[str, str], ...]
+    alike: tuple[FreeForm, ...]
+
+    @property
+    def form(self) -> FreeForm:
+        """The term alone, as something that may act in other records."""
+        return FreeForm(self.place, self.quantity, self.at, self.estimate, self.relative)
 
 
 def missing_term(
@@ -125,31 +131,30 @@ def missing_term(
     alike = _alike(finalists)
     # Whatever moves is a function of time: that is the last of all reasons.
     best = min(alike, key=lambda d: (not _at_home(d), d.settled.curve.quantity == TIME, d.cost))
-    others = dict.fromkeys(d.settled.curve[:2] for d in (*alike, *_alike(every)))
+    others: dict[tuple[str, str], _Drawn] = {}
+    for d in (*alike, *_alike(every)):
+        others.setdefault(d.settled.curve[:2], d)
     curve, smooth = best.settled.curve, best.smooth
-    place, quantity = curve[:2]
-    probe = probe_at(bench, place)
-    free = best.settled.free
-    term, lines = (along_records(curve, of)[..., bench.present] for of in (smooth.coefficients, free))
-    coefficients = smooth.coefficients + _least(term, lines) @ free
+    coefficients, form = _least_of(bench, best), _form_of(bench, best)
+    probe = probe_at(bench, form.place)
     variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - best.left - smooth.pieces
     found = MissingTerm(
-        place=place,
-        unit="" if curve.relative else bench.fit.model.unit(place),
-        quantity=quantity,
-        quantity_unit=quantity_unit(bench.fit.model, quantity),
-        at=curve.knots,
-        estimate=probe * coefficients @ curve.values,
+        place=form.place,
+        unit="" if form.relative else bench.fit.model.unit(form.place),
+        quantity=form.quantity,
+        quantity_unit=quantity_unit(bench.fit.model, form.quantity),
+        at=form.at,
+        estimate=form.estimate,
         deviation=probe * np.sqrt(variances),
         series=probe * along_records(curve, coefficients)[bench.present],
-        relative=curve.relative,
+        relative=form.relative,
         period=float(curve.periods[0]) if len(curve.periods) else None,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
         pieces=smooth.pieces,
         residual=best.residual,
-        alike=tuple(other for other in others if other != (place, quantity)),
+        alike=tuple(_form_of(bench, d) for where, d in others.items() if where != (form.place, form.quantity)),
     )
     return found, curve
 
@@ -158,6 +163,20 @@ def told_by(bench: Workbench, final: Refits, noise: Noise, curve: Curve) -> Work
     """Return the bench with a curve that acts as the readings of this noise tell it, and no others."""
     drawn = _drawn(bench, final, noise, curve, final.points[0], np.zeros(len(curve.values)))
     return bench_with(bench, curve, drawn.smooth.coefficients)
+
+
+def _form_of(bench: Workbench, drawn: "_Drawn") -> FreeForm:
+    """Return a term as it is told."""
+    curve = drawn.settled.curve
+    estimate = probe_at(bench, curve.place) * _least_of(bench, drawn) @ curve.values
+    return FreeForm(curve.place, curve.quantity, curve.knots, estimate, curve.relative)
+
+
+def _least_of(bench: Workbench, drawn: "_Drawn") -> Float[np.ndarray, " piece"]:
+    """Return the coefficients of a smooth curve, in probes, the least of those that explain the records as well."""
+    curve, smooth, free = drawn.settled.curve, drawn.smooth, drawn.settled.free
+    term, lines = (along_records(curve, of)[..., bench.present] for of in (smooth.coefficients, free))
+    return smooth.coefficients + _least(term, lines) @ free
 
 
 def _least(term, free) -> Float[np.ndarray, " line"]:

@@ -13,6 +13,7 @@ from ehsvjax.diagnosis.results.causes import Cause, Left
 from ehsvjax.diagnosis.results.explanations import Explanation
 from ehsvjax.diagnosis.results.gain import Gain
 from ehsvjax.diagnosis.results.misfit import Misfit
+from ehsvjax.draws import check_key
 from ehsvjax.effects.effect import Effect
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
@@ -102,6 +103,11 @@ class Diagnosis:
         return {*self.names, *(name for group in self.alternatives for name in group.causes)}
 
     @property
+    def leaves_something(self) -> bool:
+        """Whether something is left that no cause explains: `missing` then acts beside them, else in their place."""
+        return self.verdict == "unexplained" or not self.innocent
+
+    @property
     def left(self) -> Left:
         """What no cause explains: how much of it, where it shows, along what; see `missing` for its form."""
         test = None if self.innocent or not self.misfit.tests_after else self.misfit.tests_after[0]
@@ -156,8 +162,9 @@ class Diagnosis:
     ) -> "Plan":
         """Return the experiment that would tell what these records cannot; see `ehsvjax.next_experiment`.
 
-        The four most probable explanations of each cause are told from each other. With `against`, those are left
-        aside: what is told is whether an effect of that size is there, which these records may not show.
+        The four most probable explanations of each cause are told from each other; where there are none, the forms that
+        a missing term may have. With `against`, those are left aside: what is told is whether an effect of that size is
+        there, which these records may not show.
 
         Args:
             limits: of the inputs, of outputs, of time.
@@ -176,11 +183,40 @@ class Diagnosis:
         from ehsvjax.experiment import next_experiment
         from ehsvjax.experiment.questions import doubts_of, undecided_of
 
-        explanations, pairs = undecided_of(self) if against is None else doubts_of(self, against)
+        explanations, pairs = undecided_of(self, key) if against is None else doubts_of(self, against)
         return next_experiment(
             explanations, limits, key=key, can_change=can_change, can_add=can_add, records=records, own=own,
             pairs=pairs, generations=generations,
         )  # fmt: skip
+
+    def with_missing_term(self, *, key: "Key[Array, '']") -> Fit:
+        """Return the extended fit with the missing term in its simulation: straight pieces, identified with all else.
+
+        Further from the truth than the noise, `missing` tells the term along a motion that is itself wrong; here it
+        acts on the motion that it makes. What it is worth is seen like that of any fit, on records that were not used.
+
+        Args:
+            key: random key, `jax.random.key(0)`.
+
+        Raises:
+            ValueError: where nothing is missing, or what is depends on what the model does not know at its place, such
+                as the time.
+
+        """
+        from ehsvjax.diagnosis.results.with_term import with_term
+        from ehsvjax.effects.free_form import attachable
+
+        check_key(key)
+        if self.missing is None or not self.leaves_something:
+            raise ValueError(f"expected a diagnosis that leaves something, got {self.verdict!r} with no missing term")
+        term = attachable(self.missing.form, self.extended.model)
+        if term is None:
+            raise ValueError(
+                f"expected a missing term that depends on what {self.extended.model.name} passes at "
+                f"{self.missing.place}, got {self.missing.form}: write an effect (ehsvjax.effects.Effect) and diagnose "
+                "again with it in the bank"
+            )
+        return with_term(self.extended, term, key)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.

@@ -192,7 +192,7 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
         unit = "of its value" if m.relative else m.unit
         peak = int(np.argmax(np.abs(m.estimate)))
         # Several causes may stand for one that the bank lacks.
-        instead = diagnosis.innocent and diagnosis.verdict != "unexplained"
+        instead = not diagnosis.leaves_something
         along = f"as a function of {m.quantity}{_repeating(m.period, m.quantity_unit)}"
         lines.append(
             f"{'one term of another form would explain it as well,' if instead else 'missing'} at {m.place}, {along}: "
@@ -200,8 +200,8 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             f"; it takes {100 * m.explained:.0f}% of what is left (see .missing and .plot())"
         )
         if m.alike:
-            others = " or ".join(f"at {place}, as a function of {quantity}" for place, quantity in m.alike)
-            lines.append(f"a term {others} would explain as much")
+            others = " or ".join(map(str, m.alike))
+            lines.append(f"{others} would explain as much")
     return lines
 
 
@@ -333,13 +333,17 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
     lines = [
         f"to tell {' from '.join(a.causes)}: {a.settled_by}" for a in diagnosis.alternatives if a.settled_by
     ]  # fmt: skip
-    if diagnosis.explanations:
+    missing = diagnosis.missing
+    if diagnosis.explanations or (missing is not None and missing.alike and diagnosis.verdict == "unexplained"):
         limits = ", ".join(f"{name}=(least, most)" for name in diagnosis.fit.model.inputs)
         lines.append(f"the record that would tell: .next_experiment(ehsvjax.Limits({limits}), key=key)")
     if diagnosis.alone:
         lines.append("ask what changed between these records; what each says by itself: .alone")
     elif diagnosis.verdict == "unexplained":
-        lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
+        known = "" if missing is None else "have it identified as it is: .with_missing_term(key=key); or "
+        lines.append(
+            f"{known}write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank"
+        )
     if diagnosis.verdict == "adequate":
         said = "; ".join(f"{e.cause} above {quantity(e.above, e.unit, digits=2)}" for e in diagnosis.excluded[:_NAMED])
         more = len(diagnosis.excluded) - _NAMED
