@@ -45,6 +45,23 @@ def test_beside_a_random_force_only_what_gains_beside_it_is_a_cause():
     assert PROCESS_NOISE in names_in(diagnosis)
 
 
+@pytest.mark.parametrize(
+    ("seed", "density"),
+    [
+        (471920975, 2.221569789754284e-05),
+        pytest.param(1922185331, 5.466243701559712e-05, marks=pytest.mark.thorough),
+    ],
+)
+def test_what_chance_explains_better_is_named_after_it(seed, density):
+    """A spring, 16%, came before chance, 80%; and a damping that nothing needed, once the spring was left out."""
+    diagnosis = diagnosed(seed, density)
+    assert [cause.name for cause in diagnosis.causes] == [PROCESS_NOISE], diagnosis
+    (group,) = diagnosis.alternatives
+    assert group.causes[:2] == (PROCESS_NOISE, UNKNOWN)
+    assert list(group.probabilities[2:]) == sorted(group.probabilities[2:], reverse=True)
+    assert sum(group.probabilities) == pytest.approx(1.0, abs=1e-6)
+
+
 def test_a_cause_is_named_beside_a_random_force():
     diagnosis = diagnosed(7, 1e-5, samples=672, stiffness=0.5)
     spring, chance = diagnosis.causes

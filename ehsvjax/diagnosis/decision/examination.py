@@ -25,7 +25,7 @@ class Examination(NamedTuple):
     """What is left of the residual, and of the causes.
 
     Attributes:
-        selection: with the noise of what is left, without causes that a random force can stand for.
+        selection: with the noise of what is left, without causes that a random force explains better.
         before: what the nominal model's residual depends on, the most significant first.
         after: what the extended model's residual depends on.
         innocent: whether that is nothing.
@@ -33,6 +33,7 @@ class Examination(NamedTuple):
         chance: the random force that explains what the causes leave; None if none does.
         chance_behind: of each cause, noise variances by which a random force in its place, or in that of all, is
             behind, less what chance would gain with what it stands for; infinite where none is about as likely.
+        doubted: of those, and of what could be there instead of each, by how many noise variances it is behind chance.
         left: a term of free form in what the causes leave; None where that is nothing, or chance.
         instead: one term of free form that explains the record as well as all causes together and what they leave, but
             for the price of its pieces; looked for beside several, or where they leave something; None if none does.
@@ -47,6 +48,7 @@ class Examination(NamedTuple):
     undecided: bool
     chance: ProcessNoise | None
     chance_behind: tuple[float, ...]
+    doubted: dict[str, float]
     left: MissingTerm | None
     instead: MissingTerm | None
     lacking: bool
@@ -79,8 +81,9 @@ def examine(selection: Selection) -> Examination:
     if force is not None:
         instead_of = _chance_instead(selection, force)
         least = min(instead_of, key=lambda causes: instead_of[causes], default=())
-        if least and instead_of[least] < -INSEPARABLE:
-            return examine(without(selection, least))
+        if least and instead_of[least] < 0.0:
+            rest = examine(without(selection, least))
+            return rest._replace(doubted=rest.doubted | _doubted(selection, least, -instead_of[least]))
         # What no test sees must be there by the likelihood alone.
         needed = 0.0 if _significant(after) else -2.0 * float(np.log(SIGNIFICANT))
         chance = _chance_in(selection, selection.final, force, after, needed)
@@ -100,7 +103,19 @@ def examine(selection: Selection) -> Examination:
     if lacking and chance is not None:
         innocent = False
     still_open = undecided and repeated is None
-    return Examination(selection, before, after, innocent, still_open, chance, chance_behind, left, instead, lacking)
+    return Examination(
+        selection, before, after, innocent, still_open, chance, chance_behind, {}, left, instead, lacking
+    )  # fmt: skip
+
+
+def _doubted(selection: Selection, causes: tuple[int, ...], behind: float) -> dict[str, float]:
+    """Return causes that chance explains better, and their rivals, unless they are told from it: how far behind."""
+    found: dict[str, float] = {}
+    for cause in causes:
+        for rival in selection.rivals[selection.included.index(cause)]:
+            if behind + rival.deficit < INSEPARABLE:
+                found.setdefault(selection.bench.candidates[rival.candidate].name, behind + rival.deficit)
+    return found
 
 
 def _significant(tests: tuple[Dependence, ...]) -> bool:

@@ -162,9 +162,12 @@ def select(bench: Workbench, progress: Progress) -> Selection:
 
 
 def without(selection: Selection, causes: Sequence[int]) -> Selection:
-    """Return a selection without some of its causes, what is left weighed anew."""
+    """Return a selection without some of its causes, nor others that are needless then, what is left weighed anew."""
     *stages, last = selection.stages
-    return _selection(selection.begun, stages, _weighed(_look_without(last, causes), selection.nominal))
+    weighed = _weighed(_look_without(last, causes), selection.nominal)
+    while weighed.needless is not None:
+        weighed = _weighed(_look_without(weighed.stage, [weighed.needless]), selection.nominal)
+    return _selection(selection.begun, stages, weighed)
 
 
 def _look_without(stage: Stage, causes: Sequence[int]) -> Stage:

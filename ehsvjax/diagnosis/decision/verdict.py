@@ -70,7 +70,7 @@ def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     if examined.lacking or not (examined.innocent or groups):
         return UNEXPLAINED
     others = [{name: 1.0} for name in _quantised(selection)]
-    others += [_chance(examined.chance)] if examined.chance else []
+    others += [_chance(examined.chance, examined.doubted)] if examined.chance else []
     included = (*(selection.included[k] for k in order), *(None for _ in others))
     every = (*groups, *others)
     if not every:
@@ -110,12 +110,15 @@ def _nothing_behind(need: Need) -> float:
     return need.gain - need.required
 
 
-def _chance(chance: ProcessNoise) -> dict[str, float]:
-    """Return what may be there of chance: unless the experiment was repeated, nothing speaks for it against a term that
-    the bank lacks.
+def _chance(chance: ProcessNoise, doubted: Mapping[str, float]) -> dict[str, float]:
+    """Return what may be there of chance, and what chance explains better without being told from it.
+
+    Unless the experiment was repeated, nothing speaks for chance against a term that the bank lacks.
     """
-    certain = {PROCESS_NOISE: 1.0}
-    return certain if chance.settled else _or_unknown(certain)
+    names = sorted(doubted, key=lambda name: doubted[name])
+    likely, *others = probabilities([0.0, *(doubted[name] for name in names)]).tolist()
+    alone = {PROCESS_NOISE: likely} if chance.settled else {PROCESS_NOISE: likely / 2.0, UNKNOWN: likely / 2.0}
+    return alone | dict(zip(names, others, strict=True))
 
 
 def _quantised(selection: Selection) -> tuple[str, ...]:
