@@ -96,13 +96,12 @@ def _tried(trial: Trial) -> dict[str, Any]:
     began = time.perf_counter()
     fit = ehsvjax.identify(ball(), record, key=jax.random.key(0))
     found = ehsvjax.diagnose(fit, record, key=jax.random.key(1))
-    groups = {name for group in found.alternatives for name in group.causes}
     return {
         **trial._asdict(),
         "worth": worth(angle, trial) if trial.stiffness else 0.0,
         "verdict": found.verdict,
         "causes": [cause.name for cause in found.causes],
-        "groups": sorted(groups),
+        "groups": [group.causes for group in found.alternatives],
         "density found": found.process_noise.intensity if found.process_noise else None,
         "spring found": next((c.sizes[0].value for c in found.causes if c.name == SPRING), None),
         "seconds": time.perf_counter() - began,
@@ -110,13 +109,18 @@ def _tried(trial: Trial) -> dict[str, Any]:
 
 
 def outcome(row: Mapping[Any, Any]) -> str:
-    """Return what an answer was: of a group that holds the spring nothing is wrong."""
+    """Return what an answer was: of a group that holds the spring, or chance, nothing is wrong."""
     named = set(row["causes"]) - {PROCESS_NOISE, UNKNOWN}
+    groups = {group[0]: set(group) for group in row["groups"]}
+    right = {SPRING} if row["stiffness"] else set()
     if not named:
         return "chance" if PROCESS_NOISE in row["causes"] else row["verdict"]
-    if row["stiffness"] and len(named) == 1 and SPRING in row["groups"]:
+    if named == right:
+        return "in a group" if SPRING in groups else "named"
+    others = [groups.get(name, {name}) for name in named - right]
+    if len(others) == 1 and not right <= named and right & others[0]:
         return "in a group"
-    return "named" if row["stiffness"] and named == {SPRING} else "a false name"
+    return "a cause or chance" if all(PROCESS_NOISE in group for group in others) else "a false name"
 
 
 def main() -> None:
@@ -135,7 +139,8 @@ def main() -> None:
     ratio = (table["density found"] / table["density"]).dropna()
     print(f"density found over that which acted: median {ratio.median():.2f}, {ratio.min():.2f} to {ratio.max():.2f}")
     print(f"seconds: median {table['seconds'].median():.0f}, at most {table['seconds'].max():.0f}")
-    print(table[table["outcome"] == "a false name"].drop(columns=["density found"]).to_string())
+    off = table["outcome"].isin(["a false name", "a cause or chance"])
+    print(table[off].drop(columns=["density found"]).to_string())
 
 
 if __name__ == "__main__":
