@@ -50,7 +50,7 @@ def found():
 
 
 def with_form(form, model):
-    term = attachable(form, model)
+    term = attachable(form, model, 9)
     return extended(model, (term.candidate,), term.numbers, 1.0)
 
 
@@ -83,8 +83,8 @@ def test_a_share_of_the_opening_is_one_of_the_flow_gain():
     ("place", "quantity"), [("force", "time"), ("force", "push"), ("force", "spool"), ("nowhere", "position")]
 )
 def test_what_a_model_does_not_know_there_is_no_effect_of_it(place, quantity):
-    assert attachable(FreeForm(place, quantity, KNOTS, KNOTS, False), carriage()) is None
-    assert attachable(FreeForm("position", "push", KNOTS, KNOTS, False), carriage()) is not None
+    assert attachable(FreeForm(place, quantity, KNOTS, KNOTS, False), carriage(), 9) is None
+    assert attachable(FreeForm("position", "push", KNOTS, KNOTS, False), carriage(), 9) is not None
 
 
 def test_what_no_effect_explains_is_identified_where_it_acts(found):
@@ -99,7 +99,34 @@ def test_what_no_effect_explains_is_identified_where_it_acts(found):
         np.std(fit.simulate(other)["position"] - other.outputs["position"]) for fit in (found.extended, wider)
     )
     assert after < 0.2 * before
-    assert min(wider.parameters[n] for n in wider.parameters if "knot" in n) == pytest.approx(-FORCE, rel=0.1)
+    names = [n for n in wider.parameters if ".at_" in n]
+    at = [float(n.rpartition(".at_")[2]) for n in names]
+    visited = found.records[0].outputs["position"]
+    told = np.interp(visited, at, [wider.parameters[n] for n in names])
+    assert np.corrcoef(told, bump(visited))[0, 1] > 0.95
+    before = np.interp(visited, found.missing.at, found.missing.estimate)
+    assert np.std(told - bump(visited)) < 0.5 * np.std(before - bump(visited))
+
+
+def test_a_fit_with_a_term_and_what_else_it_may_be_come_back_from_files(found, tmp_path):
+    sensor = FreeForm("position", "push", KNOTS, KNOTS, False)
+    either = dataclasses.replace(found, missing=found.missing._replace(alike=(sensor,)))
+    either.save(tmp_path / "diagnosis.npz")
+    again = ehsvjax.Diagnosis.load(tmp_path / "diagnosis.npz", carriage())
+    assert str(again) == str(either) and str(again.missing.alike[0]) == str(sensor)
+    wider = found.with_missing_term(key=KEY)
+    wider.save(tmp_path / "fit.npz")
+    same = ehsvjax.Fit.load(tmp_path / "fit.npz", carriage())
+    assert same.parameters == wider.parameters
+    before, after = (fit.simulate(fit.records[0])["position"] for fit in (wider, same))
+    assert np.array_equal(before, after)
+
+
+@pytest.mark.parametrize("value", [0.05, -0.0123456, 12345.6, 3e-9, 0.0])
+def test_the_numbers_of_a_term_say_where_it_acts(value):
+    form = FreeForm("force", "position", np.array([value, 1e6]), np.ones(2), False)
+    (name, _) = attachable(form, carriage(), 2).numbers
+    assert float(name.rpartition(".at_")[2]) == pytest.approx(value, rel=1e-4)
 
 
 def test_what_leaves_nothing_has_no_missing_term(found):

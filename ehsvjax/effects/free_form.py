@@ -1,5 +1,7 @@
 """A term whose form no effect has: a curve along one quantity, as records tell it, made an effect like any other."""
 
+import functools
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,8 +13,9 @@ from ehsvjax.effects.effect import Candidate, Effect, amplitude, constant, input
 from ehsvjax.effects.internal import contexts_of
 from ehsvjax.models.model import Model, Parameter
 
-# Knots of the effect, each a number that is identified, at most.
-_KNOTS = 16
+# How such an effect is called: a term along something, a share of the value there, along the value itself; and how its
+# numbers are, what acts at so much of that.
+_TERM, _SHARE, _ITSELF, _AT = "term_along_", "share_along_", "itself", "at_"
 # How far from its estimate each may be, over the largest of them.
 _REACH = 2.0
 
@@ -41,16 +44,22 @@ class FreeForm(NamedTuple):
 
 
 class Attachable(NamedTuple):
-    """A term as an effect of a model, and its numbers, bounded about what they are."""
+    """A term as an effect of a model, and its numbers, bounded about what they are, each at a knot of those `at`."""
 
     candidate: Candidate
     numbers: dict[str, Parameter]
+    at: Float[np.ndarray, " knot"]
+
+    def told(self, form: FreeForm, parameters: Mapping[str, float]) -> FreeForm:
+        """Return the form as the parameters of a model with the effect have it."""
+        found = [parameters[name] for name in self.numbers]
+        return form._replace(estimate=np.interp(form.at, self.at, found))
 
 
-def attachable(form: FreeForm, model: Model) -> Attachable | None:
+def attachable(form: FreeForm, model: Model, knots: int) -> Attachable | None:
     """Return a term as an effect at its place in a model; None where the model does not know there what it depends on.
 
-    Its numbers are what acts at some of the knots: records tell the form anew, in the simulation that it acts in.
+    Its numbers are what acts at so many of its knots at most: records tell the form anew, in the simulation.
     Between its knots the curve is straight; beyond them it stays as it is at the last one.
     """
     kind = next((s.kind for s in model.signals if s.name == form.place), None)
@@ -58,20 +67,13 @@ def attachable(form: FreeForm, model: Model) -> Attachable | None:
     known = [name for name in (form.quantity, input_named(form.quantity)) if name in there]
     if kind is None or not (known or form.quantity == form.place):
         return None
-    along = None if form.quantity == form.place else known[0]
+    along = _ITSELF if form.quantity == form.place else known[0]
     # As many of its knots between each two: they lie where the samples do.
-    kept = np.unique(np.linspace(0, len(form.at) - 1, min(len(form.at), _KNOTS)).round().astype(int))
-    at, estimate = form.at[kept], form.estimate[kept]
-    names = [f"at_knot_{k}" for k in range(len(at))]
-    unit = "" if form.relative else "{value}"
-    effect = Effect(
-        name=f"term_along_{form.quantity}",
-        kind=kind,
-        parameters=tuple(amplitude(name, unit, constant(1e-3)) for name in names),
-        apply=_Curve(along, tuple(at.tolist()), tuple(names), form.relative),
-        needs=() if along is None else (along,),
-        says="a term of a form that no effect has",
-    )
+    kept = np.linspace(0, len(form.at) - 1, min(len(form.at), knots)).round().astype(int)
+    names = tuple(dict.fromkeys(_named(value) for value in form.at[kept].tolist()))
+    at = np.array([_value(name) for name in names])
+    estimate = np.interp(at, form.at, form.estimate)
+    effect = _effect((_SHARE if form.relative else _TERM) + along, kind, names)
     candidate = Candidate(effect, form.place, f"{effect.name}@{form.place}")
     reach = _REACH * float(np.max(np.abs(estimate)))
     numbers = {}
@@ -79,20 +81,51 @@ def attachable(form: FreeForm, model: Model) -> Attachable | None:
         name = candidate.parameter(number.name)
         unit = candidate.unit(number, model)
         numbers[name] = Parameter(name, name, unit, value, value - reach, value + reach)
-    return Attachable(candidate, numbers)
+    return Attachable(candidate, numbers, at)
+
+
+def effect_of_term(name: str, kind: str, numbers: tuple[str, ...]) -> Effect | None:
+    """Return the effect of a term by its name, the kind of its signal and its numbers, which say it all; or None."""
+    terms = name.startswith((_TERM, _SHARE)) and all(number.startswith(_AT) for number in numbers)
+    return _effect(name, kind, tuple(numbers)) if terms else None
+
+
+@functools.cache
+def _effect(name: str, kind: str, numbers: tuple[str, ...]) -> Effect:
+    """Return the effect of a curve with these knots, the same object for the same ones."""
+    relative = name.startswith(_SHARE)
+    along = name.removeprefix(_SHARE if relative else _TERM)
+    return Effect(
+        name=name,
+        kind=kind,
+        parameters=tuple(amplitude(number, "" if relative else "{value}", constant(1e-3)) for number in numbers),
+        apply=_Curve(along, numbers, relative),
+        needs=() if along == _ITSELF else (along,),
+        says="a term of a form that no effect has",
+    )
+
+
+def _named(value: float) -> str:
+    """Return the name of what acts at a knot: its value to five digits, without a point."""
+    mantissa, exponent = f"{value:.4e}".split("e")
+    return f"{_AT}{mantissa.replace('.', '')}e{int(exponent) - 4}"
+
+
+def _value(name: str) -> float:
+    return float(name.removeprefix(_AT))
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """The effect of a curve: those of the same knots are compiled once."""
+    """What the effect of a curve does: one of the same knots is compiled once."""
 
-    along: str | None
-    at: tuple[float, ...]
+    along: str
     names: tuple[str, ...]
     relative: bool
 
     def __call__(self, own, value, context):
-        quantity = jnp.asarray(value if self.along is None else context[self.along], float)
-        knots, here = jnp.asarray(self.at, quantity.dtype), jnp.stack([own[name] for name in self.names])
+        quantity = jnp.asarray(value if self.along == _ITSELF else context[self.along], float)
+        knots = jnp.asarray([_value(name) for name in self.names], quantity.dtype)
+        here = jnp.stack([own[name] for name in self.names])
         added = jnp.interp(quantity, knots, here)
         return value + (value * added if self.relative else added)

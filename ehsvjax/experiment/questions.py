@@ -56,11 +56,11 @@ def _terms_of(diagnosis: Diagnosis, key: Key[Array, ""]) -> dict[str, Fit]:
     """Return the forms that a missing term may have, each beside what was found; not those that go by the clock."""
     missing, plain = diagnosis.missing, diagnosis.extended
     forms = (missing.form, *missing.alike) if missing is not None and diagnosis.leaves_something else ()
-    attached = {str(form): attachable(form, plain.model) for form in forms}
-    able = {name: term for name, term in attached.items() if term is not None}
-    if len(able) < 2:
+    some = [form for form in forms if attachable(form, plain.model, 2) is not None][:_MOST]
+    if len(some) < 2:
         return {}
-    return {name: with_term(plain, able[name], key) for name in list(able)[:_MOST]}
+    fits = {str(form): with_term(plain, form, key) for form in some}
+    return {name: fit for name, fit in fits.items() if fit is not None}
 
 
 def doubts_of(diagnosis: Diagnosis, against: Mapping[str, float]) -> tuple[dict[str, Fit], list[Pair]]:

@@ -7,6 +7,7 @@ from typing import Any
 from ehsvjax.effects import BANK
 from ehsvjax.effects.effect import Effect
 from ehsvjax.effects.extended import extended
+from ehsvjax.effects.free_form import effect_of_term
 from ehsvjax.effects.of_model import effect_of_model
 from ehsvjax.models.model import Equations, Model
 from ehsvjax.models.servovalve import servovalve
@@ -63,7 +64,7 @@ def find_model(described: Mapping[str, Any], decoded: Callable[[Any], Any], mode
 
 def describe_effect(effect: Effect) -> dict[str, Any]:
     """Return by what an effect is found again: its name, the kind of signal, its numbers, and whose it is."""
-    known = effect in BANK or effect == effect_of_model(*_key(effect))
+    known = effect in BANK or effect == _of_this_package(*_key(effect))
     return {"key": _key(effect), "own": not known}
 
 
@@ -82,13 +83,18 @@ def find_effect(described: Mapping[str, Any], bank: Sequence[Effect]) -> Effect:
         if _key(effect) == described["key"]:
             return effect
     name, kind, numbers = described["key"]
-    found = None if described["own"] else effect_of_model(name, kind, numbers)
+    found = None if described["own"] else _of_this_package(name, kind, numbers)
     if found is not None:
         return found
     raise ValueError(
         f"an effect {name!r} on signals of kind {kind!r} with the numbers {', '.join(numbers)}, which the bank does "
         "not have: hand it over, .load(path, bank=(*ehsvjax.effects.BANK, my_effect))"
     )
+
+
+def _of_this_package(name: str, kind: str, numbers: Sequence[str]) -> Effect | None:
+    """Return an effect that this package makes of a model, or of what a record leaves."""
+    return effect_of_model(name, kind, numbers) or effect_of_term(name, kind, tuple(numbers))
 
 
 def _maker_of(model: Model) -> str | None:

@@ -204,19 +204,18 @@ class Diagnosis:
 
         """
         from ehsvjax.diagnosis.results.with_term import with_term
-        from ehsvjax.effects.free_form import attachable
 
         check_key(key)
         if self.missing is None or not self.leaves_something:
             raise ValueError(f"expected a diagnosis that leaves something, got {self.verdict!r} with no missing term")
-        term = attachable(self.missing.form, self.extended.model)
-        if term is None:
+        found = with_term(self.extended, self.missing.form, key)
+        if found is None:
             raise ValueError(
                 f"expected a missing term that depends on what {self.extended.model.name} passes at "
                 f"{self.missing.place}, got {self.missing.form}: write an effect (ehsvjax.effects.Effect) and diagnose "
                 "again with it in the bank"
             )
-        return with_term(self.extended, term, key)
+        return found
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.

@@ -4,20 +4,29 @@ from jaxtyping import Array, Key
 
 from ehsvjax.diagnosis.bench.workbench import duration_of
 from ehsvjax.effects.extended import DURATION, extended
-from ehsvjax.effects.free_form import Attachable
+from ehsvjax.effects.free_form import FreeForm, attachable
 from ehsvjax.fit import Fit
 from ehsvjax.identify import identify
 
+# Knots, the few first: told along a motion that was wrong, a curve of many is caught where the motion is not yet right.
+_KNOTS = (5, 17)
 # Individuals beside the one from which the model is refined.
 _POPULATION = 20
 
 
-def with_term(plain: Fit, term: Attachable, key: Key[Array, ""]) -> Fit:
-    """Return a fit of its model with a term, all identified anew from where they are known to be."""
+def with_term(plain: Fit, form: FreeForm, key: Key[Array, ""]) -> Fit | None:
+    """Return a fit of its model with a term, all identified anew; None where the model cannot have that term."""
     duration = plain.model.nominal.get(DURATION, duration_of(plain.records))
-    model = extended(plain.model, (term.candidate,), term.numbers, duration)
     known = [{n: v for n, v in one.items() if n not in plain.estimated_initial} for one in plain.initial]
-    return identify(
-        model, plain.records, key=key, start=plain.parameters, initial=known, population=_POPULATION, generations=1,
-        starts=1,
-    )  # fmt: skip
+    found = plain
+    for knots in _KNOTS:
+        term = attachable(form, plain.model, knots)
+        if term is None:
+            return None
+        model = extended(plain.model, (term.candidate,), term.numbers, duration)
+        start = {name: found.parameters[name] for name in plain.parameters}
+        found = identify(
+            model, plain.records, key=key, start=start, initial=known, population=_POPULATION, generations=1, starts=1
+        )
+        form = term.told(form, found.parameters)
+    return found
