@@ -8,6 +8,7 @@ import ehsvjax
 from ehsvjax.diagnosis.bench.evidence import INSEPARABLE
 from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.decision.prediction import Predicted
+from ehsvjax.diagnosis.results.gain import Gain, OutputGain
 from tests.hidden_records import Hidden, records
 from tests.small_models import carriage, carriage_plant
 
@@ -150,3 +151,23 @@ def test_a_straight_line_is_no_better_reason_than_two_effects_that_make_it():
     fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=key, population=50, generations=20)
     found = ehsvjax.diagnose(fit, record, key=key)
     assert set(pair) <= {*found.names, *(name for a in found.alternatives for name in a.causes)}, str(found)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "worse"),
+    [
+        ([(2.0, 1.0, 0.5)], False),
+        ([(1.0, 2.0, -3.0)], True),
+        # Slightly worse where there was nothing to gain, and much better elsewhere.
+        ([(1.0, 1.01, -0.2), (9.0, 2.0, 0.9)], False),
+        ([(1.0, 1.01, -0.2), (9.0, 8.0, -0.1)], True),
+        ([(1.0, 1.0, float("nan"))], False),
+    ],
+)
+def test_causes_predict_worse_where_some_output_is_worse_and_none_is_surely_better(outputs, worse):
+    """Of each output the errors before and after, and the least share that is removed."""
+    gains = {
+        f"output {k}": OutputGain(before, after, 0.0, 0.0, 0.1, share, (share, 1.0))
+        for k, (before, after, share) in enumerate(outputs)
+    }
+    assert Gain(gains, (), (), "", (), ()).worse == worse

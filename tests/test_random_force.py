@@ -62,6 +62,13 @@ def test_what_chance_explains_better_is_named_after_it(seed, density):
     assert sum(group.probabilities) == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.thorough
+def test_causes_that_leave_something_and_predict_worse_are_not_named():
+    """A spring and a constant force, by whose model the held-back data came out worse by a third."""
+    diagnosis = diagnosed(1568853910, 2.8866660624402016e-05)
+    assert names_in(diagnosis) == CHANCE, diagnosis
+
+
 def test_a_cause_is_named_beside_a_random_force():
     diagnosis = diagnosed(7, 1e-5, samples=672, stiffness=0.5)
     spring, chance = diagnosis.causes

@@ -105,10 +105,10 @@ def _diagnosed(
     if len(records) > 1 and not _explained(verdict.word, examined.innocent, examined.chance):
         alone = _each_alone(fit, records, bank, rng, say)
     disagree = bool(alone) and not _confirmed(verdict, alone)
-    worse = verdict.word == "unexplained" and any(g.rmse_after > g.rmse_before for g in gain.outputs.values())
-    if disagree or worse:
-        # What was added on the way to no explanation does not predict, or stands for what single records have: it is
-        # left out again, and all is judged anew.
+    leaves_something = verdict.word == "unexplained" or not examined.innocent
+    if disagree or (leaves_something and gain.worse):
+        # What explains a part and predicts worse than nothing, or stands for what single records have, is left out
+        # again, and all is judged anew.
         examined = examine(selection.without_causes())
         wider, gain, verdict = _judged(examined, nominal, validation, rng)
     if disagree:

@@ -58,6 +58,11 @@ class Gain(NamedTuple):
     left_open: tuple[bool, ...]
     predicted_by: tuple[bool, ...]
 
+    @property
+    def worse(self) -> bool:
+        """Whether some output is predicted worse with the causes than without any, and none better but by chance."""
+        return not _better(self.outputs) and any(g.rmse_after > g.rmse_before for g in self.outputs.values())
+
 
 class _Judged(NamedTuple):
     """One record, or a part of it, that was not used, by output: residuals before and after, readings, the noise."""
