@@ -1,7 +1,6 @@
 """A term whose form no effect has: a curve along one quantity, as records tell it, made an effect like any other."""
 
 import functools
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,6 +15,9 @@ from ehsvjax.models.model import Model, Parameter
 # How such an effect is called: a term along something, a share of the value there, along the value itself; and how its
 # numbers are, what acts at so much of that.
 _TERM, _SHARE, _ITSELF, _AT = "term_along_", "share_along_", "itself", "at_"
+# Knots at most, and the share of its height by which a curve of straight pieces between them may be off, or which is
+# nothing: that is held as it is.
+_KNOTS, _OFF, _NOTHING = 17, 0.02, 0.05
 # How far from its estimate each may be, over the largest of them.
 _REACH = 2.0
 
@@ -44,23 +46,17 @@ class FreeForm(NamedTuple):
 
 
 class Attachable(NamedTuple):
-    """A term as an effect of a model, and its numbers, bounded about what they are, each at a knot of those `at`."""
+    """A term as an effect of a model, and its numbers, bounded about what they are."""
 
     candidate: Candidate
     numbers: dict[str, Parameter]
-    at: Float[np.ndarray, " knot"]
-
-    def told(self, form: FreeForm, parameters: Mapping[str, float]) -> FreeForm:
-        """Return the form as the parameters of a model with the effect have it."""
-        found = [parameters[name] for name in self.numbers]
-        return form._replace(estimate=np.interp(form.at, self.at, found))
 
 
-def attachable(form: FreeForm, model: Model, knots: int) -> Attachable | None:
+def attachable(form: FreeForm, model: Model) -> Attachable | None:
     """Return a term as an effect at its place in a model; None where the model does not know there what it depends on.
 
-    Its numbers are what acts at so many of its knots at most: records tell the form anew, in the simulation.
-    Between its knots the curve is straight; beyond them it stays as it is at the last one.
+    Its numbers are what acts at the knots that its form needs: records tell them anew, in the simulation. Between knots
+    the curve is straight; beyond them it stays as it is at the last one, and where there is nothing it stays that.
     """
     kind = next((s.kind for s in model.signals if s.name == form.place), None)
     there = (*contexts_of(model).get(form.place, ()), *(input_named(name) for name in model.inputs if kind == "sensor"))
@@ -68,20 +64,31 @@ def attachable(form: FreeForm, model: Model, knots: int) -> Attachable | None:
     if kind is None or not (known or form.quantity == form.place):
         return None
     along = _ITSELF if form.quantity == form.place else known[0]
-    # As many of its knots between each two: they lie where the samples do.
-    kept = np.linspace(0, len(form.at) - 1, min(len(form.at), knots)).round().astype(int)
+    kept = _needed(form)
     names = tuple(dict.fromkeys(_named(value) for value in form.at[kept].tolist()))
-    at = np.array([_value(name) for name in names])
-    estimate = np.interp(at, form.at, form.estimate)
+    estimate = np.interp([_value(name) for name in names], form.at, form.estimate)
     effect = _effect((_SHARE if form.relative else _TERM) + along, kind, names)
     candidate = Candidate(effect, form.place, f"{effect.name}@{form.place}")
-    reach = _REACH * float(np.max(np.abs(estimate)))
+    height = float(np.max(np.abs(estimate)))
     numbers = {}
     for number, value in zip(effect.parameters, estimate.tolist(), strict=True):
         name = candidate.parameter(number.name)
         unit = candidate.unit(number, model)
-        numbers[name] = Parameter(name, name, unit, value, value - reach, value + reach)
-    return Attachable(candidate, numbers, at)
+        nothing, reach = abs(value) < _NOTHING * height, _REACH * height
+        numbers[name] = Parameter(name, name, unit, value, value - reach, value + reach, fixed=nothing, certain=nothing)
+    return Attachable(candidate, numbers)
+
+
+def _needed(form: FreeForm) -> list[int]:
+    """Return which knots straight pieces need: the ends, then where they are furthest off with those before."""
+    kept = [0, len(form.at) - 1]
+    least = _OFF * float(np.max(np.abs(form.estimate)))
+    while len(kept) < min(_KNOTS, len(form.at)):
+        off = np.abs(form.estimate - np.interp(form.at, form.at[kept], form.estimate[kept]))
+        if not off.max() > least:
+            break
+        kept = sorted({*kept, int(np.argmax(off))})
+    return sorted(set(kept))
 
 
 def effect_of_term(name: str, kind: str, numbers: tuple[str, ...]) -> Effect | None:

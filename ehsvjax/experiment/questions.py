@@ -56,7 +56,7 @@ def _terms_of(diagnosis: Diagnosis, key: Key[Array, ""]) -> dict[str, Fit]:
     """Return the forms that a missing term may have, each beside what was found; not those that go by the clock."""
     missing, plain = diagnosis.missing, diagnosis.extended
     forms = (missing.form, *missing.alike) if missing is not None and diagnosis.leaves_something else ()
-    some = [form for form in forms if attachable(form, plain.model, 2) is not None][:_MOST]
+    some = [form for form in forms if attachable(form, plain.model) is not None][:_MOST]
     if len(some) < 2:
         return {}
     fits = {str(form): with_term(plain, form, key) for form in some}

@@ -19,6 +19,8 @@ from ehsvjax.diagnosis.hypotheses.curves import (
     Curve,
     along_records,
     bench_with,
+    hats,
+    knots_along,
     outputs_with,
     probe_at,
     quantity_unit,
@@ -64,6 +66,8 @@ class MissingTerm(NamedTuple):
         explained: share of the residual's sum of squares above the noise that it takes.
         pieces: effective number of them, for smooth as it is; a single wave counts as three.
         residual: `[record, time, signal]` what the records are with it, less what is simulated.
+        form: the term alone, as something that may act in other records: along the motion that was measured, where it
+            was, and not along that of a model that lacks the term.
         alike: other terms, at other places or along other quantities, that explain the records as well.
 
     """
@@ -81,12 +85,8 @@ class MissingTerm(NamedTuple):
     explained: float
     pieces: float
     residual: Float[np.ndarray, "record time signal"]
+    form: FreeForm
     alike: tuple[FreeForm, ...]
-
-    @property
-    def form(self) -> FreeForm:
-        """The term alone, as something that may act in other records."""
-        return FreeForm(self.place, self.quantity, self.at, self.estimate, self.relative)
 
 
 def missing_term(
@@ -136,25 +136,26 @@ def missing_term(
         others.setdefault(d.settled.curve[:2], d)
     curve, smooth = best.settled.curve, best.smooth
     coefficients, form = _least_of(bench, best), _form_of(bench, best)
-    probe = probe_at(bench, form.place)
+    probe = probe_at(bench, curve.place)
     variances = np.sum(curve.values * (smooth.covariance @ curve.values), axis=0)
     excess = float(r @ r) - (len(r) - known.shape[1])
     taken = float(r @ r) - best.left - smooth.pieces
     found = MissingTerm(
-        place=form.place,
-        unit="" if form.relative else bench.fit.model.unit(form.place),
-        quantity=form.quantity,
-        quantity_unit=quantity_unit(bench.fit.model, form.quantity),
-        at=form.at,
-        estimate=form.estimate,
+        place=curve.place,
+        unit="" if curve.relative else bench.fit.model.unit(curve.place),
+        quantity=curve.quantity,
+        quantity_unit=quantity_unit(bench.fit.model, curve.quantity),
+        at=curve.knots,
+        estimate=probe * coefficients @ curve.values,
         deviation=probe * np.sqrt(variances),
         series=probe * along_records(curve, coefficients)[bench.present],
-        relative=form.relative,
+        relative=curve.relative,
         period=float(curve.periods[0]) if len(curve.periods) else None,
         explained=float(np.clip(taken / max(excess, 1e-300), 0.0, 1.0)),
         pieces=smooth.pieces,
         residual=best.residual,
-        alike=tuple(_form_of(bench, d) for where, d in others.items() if where != (form.place, form.quantity)),
+        form=form,
+        alike=tuple(_form_of(bench, d) for where, d in others.items() if where != curve[:2]),
     )
     return found, curve
 
@@ -166,10 +167,19 @@ def told_by(bench: Workbench, final: Refits, noise: Noise, curve: Curve) -> Work
 
 
 def _form_of(bench: Workbench, drawn: "_Drawn") -> FreeForm:
-    """Return a term as it is told."""
-    curve = drawn.settled.curve
-    estimate = probe_at(bench, curve.place) * _least_of(bench, drawn) @ curve.values
-    return FreeForm(curve.place, curve.quantity, curve.knots, estimate, curve.relative)
+    """Return a term as it acts, along what was measured of the motion, where that is what it depends on."""
+    curve, samples = drawn.settled.curve, bench.problem.samples
+    coefficients = probe_at(bench, curve.place) * _least_of(bench, drawn)
+    if curve.quantity not in bench.problem.observed:
+        return FreeForm(curve.place, curve.quantity, curve.knots, coefficients @ curve.values, curve.relative)
+    output = bench.problem.observed.index(curve.quantity)
+    known, series = samples.measured[..., output], along_records(curve, coefficients)
+    # What a sensor adds depends on what is there without it.
+    added = series if curve.place == curve.quantity else 0.0
+    along = (samples.outputs[..., output] - added)[known]
+    at = knots_along(along, len(along) // _SAMPLES_PER_KNOT)
+    estimate = np.linalg.lstsq(hats(at, along).T, series[known], rcond=None)[0]
+    return FreeForm(curve.place, curve.quantity, at, estimate, curve.relative)
 
 
 def _least_of(bench: Workbench, drawn: "_Drawn") -> Float[np.ndarray, " piece"]:

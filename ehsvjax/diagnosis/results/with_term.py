@@ -8,25 +8,19 @@ from ehsvjax.effects.free_form import FreeForm, attachable
 from ehsvjax.fit import Fit
 from ehsvjax.identify import identify
 
-# Knots, the few first: told along a motion that was wrong, a curve of many is caught where the motion is not yet right.
-_KNOTS = (5, 17)
 # Individuals beside the one from which the model is refined.
 _POPULATION = 20
 
 
 def with_term(plain: Fit, form: FreeForm, key: Key[Array, ""]) -> Fit | None:
     """Return a fit of its model with a term, all identified anew; None where the model cannot have that term."""
+    term = attachable(form, plain.model)
+    if term is None:
+        return None
     duration = plain.model.nominal.get(DURATION, duration_of(plain.records))
+    model = extended(plain.model, (term.candidate,), term.numbers, duration)
     known = [{n: v for n, v in one.items() if n not in plain.estimated_initial} for one in plain.initial]
-    found = plain
-    for knots in _KNOTS:
-        term = attachable(form, plain.model, knots)
-        if term is None:
-            return None
-        model = extended(plain.model, (term.candidate,), term.numbers, duration)
-        start = {name: found.parameters[name] for name in plain.parameters}
-        found = identify(
-            model, plain.records, key=key, start=start, initial=known, population=_POPULATION, generations=1, starts=1
-        )
-        form = term.told(form, found.parameters)
-    return found
+    return identify(
+        model, plain.records, key=key, start=plain.parameters, initial=known, population=_POPULATION, generations=1,
+        starts=1,
+    )  # fmt: skip
