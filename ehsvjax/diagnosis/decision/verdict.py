@@ -70,7 +70,10 @@ def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     if examined.lacking or not (examined.innocent or groups):
         return UNEXPLAINED
     others = [{name: 1.0} for name in _quantised(selection)]
-    others += [_chance(examined.chance, examined.doubted)] if examined.chance else []
+    if examined.chance:
+        named = {next(iter(group)) for group in groups}
+        doubted = {name: behind for name, behind in examined.doubted.items() if name not in named}
+        others.append(_chance(examined.chance, doubted))
     included = (*(selection.included[k] for k in order), *(None for _ in others))
     every = (*groups, *others)
     if not every:

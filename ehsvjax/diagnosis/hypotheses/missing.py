@@ -19,8 +19,6 @@ from ehsvjax.diagnosis.hypotheses.curves import (
     Curve,
     along_records,
     bench_with,
-    hats,
-    knots_along,
     outputs_with,
     probe_at,
     quantity_unit,
@@ -174,11 +172,13 @@ def _form_of(bench: Workbench, drawn: "_Drawn") -> FreeForm:
         return FreeForm(curve.place, curve.quantity, curve.knots, coefficients @ curve.values, curve.relative)
     output = bench.problem.observed.index(curve.quantity)
     known, series = samples.measured[..., output], along_records(curve, coefficients)
+    acting = series[known]
     # What a sensor adds depends on what is there without it.
     added = series if curve.place == curve.quantity else 0.0
     along = (samples.outputs[..., output] - added)[known]
-    at = knots_along(along, len(along) // _SAMPLES_PER_KNOT)
-    estimate = np.linalg.lstsq(hats(at, along).T, series[known], rcond=None)[0]
+    parts = np.array_split(np.argsort(along), max(len(along) // _SAMPLES_PER_KNOT, 2))
+    at, first = np.unique([along[part].mean() for part in parts], return_index=True)
+    estimate = np.array([acting[part].mean() for part in parts])[first]
     return FreeForm(curve.place, curve.quantity, at, estimate, curve.relative)
 
 
