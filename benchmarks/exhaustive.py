@@ -15,24 +15,19 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.signal import sawtooth
 
+from benchmarks.several_outputs import steady
+from benchmarks.several_records import MODEL, OF_FIRST_ORDER, PLAIN, REFITTED, STEPS
 from tests.hidden_oracle import EXACTLY_ALIKE, variants_of
 from tests.hidden_plants import SERVOVALVE_STEP, Valve, held_levels, servovalve_with
 from tests.hidden_records import ONE_SIDED, TRUTH, excitation
 
-MODEL = "servovalve"
 # Of a plant whose load pressure is known to a few readings, s.
 PRESSURE_STEP = 2e-5
-# Deviations of the noise between two readings of a load pressure that are a jump: they tell the plant's last bit.
-JUMP = 10.0
-# Share of an effect's worth below which what a rival leaves to first order is not trusted; rivals and experiments that
-# are refitted then.
-OF_FIRST_ORDER, REFITTED, EXPERIMENTS_REFITTED = 0.03, 3, 3
+# Experiments in which rivals are refitted.
+EXPERIMENTS_REFITTED = 3
 # Of what is kept of each output, SI.
 UNIT = {"position": 1e-4, "load_pressure": 5e4}
 PARAMETERS = tuple(TRUTH[MODEL])
-# What is refitted beside an effect: the parameters, and where each of two records starts, m; changes for derivatives.
-PLAIN = np.array([*TRUTH[MODEL].values(), 0.0, 0.0])
-STEPS = np.array([*(1e-5 * PLAIN[:-2]), 1e-6, 1e-6])
 _PERIOD = excitation(MODEL, 0)[1]
 
 
@@ -164,15 +159,10 @@ def _banks(rig: Rig, made: int | Experiment, measured: tuple[str, ...]) -> dict[
     for name in run.measured:
         plain = shown[name][0]
         # A position has none.
-        kept = _steady(plain / UNIT[name]) if name == "load_pressure" else np.ones(len(plain), bool)
+        kept = steady(plain / UNIT[name]) if name == "load_pressure" else np.ones(len(plain), bool)
         changes = ((shown[name][1:] - plain) * kept / UNIT[name]).astype(np.float32)
         found[name] = Bank(plain, kept, changes, (changes @ changes.T).astype(float))
     return found
-
-
-def _steady(readings: np.ndarray) -> np.ndarray:
-    near = np.abs(np.diff(readings)) < JUMP
-    return np.append(True, near) & np.append(near, True) if len(readings) else np.ones(0, bool)
 
 
 def _joint(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -207,11 +197,11 @@ def best(question: Question) -> Best:
     if question.name in EXACTLY_ALIKE[MODEL] and question.measured == ("position",):
         return Best(0.0, EXACTLY_ALIKE[MODEL][question.name], None)
     low, high = question.rig.position
-    told = []
+    told, before = [], _truth(question, question.first)
     for second in experiments(question.rig):
         truth = _truth(question, second)
         if np.all((truth["position"] >= low) & (truth["position"] <= high)):
-            told.append((*_to_first_order(question, second, truth), second))
+            told.append((*_to_first_order(question, second, before, truth), second))
     told.sort(key=lambda each: -min(each[0].values()))
     found = Best(0.0, "", None)
     for deficits, worth, nearest, second in told[:EXPERIMENTS_REFITTED]:
@@ -238,9 +228,11 @@ class Found(NamedTuple):
     nearest: dict[str, dict[str, float]]
 
 
-def _to_first_order(question: Question, second: Experiment, truth: Mapping[str, np.ndarray]) -> Found:
+def _to_first_order(
+    question: Question, second: Experiment, before: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
+) -> Found:
     square, along, products, count = 0.0, [], [], len(PLAIN)
-    for made, shown in ((question.first, _truth(question, question.first)), (second, truth)):
+    for made, shown in ((question.first, before), (second, truth)):
         own, gram = 0.0, 0.0
         for name, bank in _banks(question.rig, made, question.measured).items():
             weight = UNIT[name] ** 2 / question.noise_variance[name]

@@ -24,7 +24,7 @@ import numpy as np
 import pandas as pd
 
 import ehsvjax
-from benchmarks.exhaustive import Question, Rig, best
+from benchmarks.exhaustive import PRESSURE_STEP, Question, Rig, best
 from benchmarks.processes import rows_of, said
 from ehsvjax import excitation as excitation_of
 from ehsvjax.diagnosis import Diagnosis
@@ -33,7 +33,7 @@ from ehsvjax.experiment import Plan
 from ehsvjax.experiment.plan import told_apart
 from ehsvjax.experiment.separation import as_said, as_said_so_far, refitted_cost
 from tests.hidden_oracle import SEPARABLE
-from tests.hidden_plants import SERVOVALVE_EFFECTS, Valve, servovalve_with
+from tests.hidden_plants import SERVOVALVE_EFFECTS, SERVOVALVE_STEP, Valve, servovalve_with
 from tests.hidden_records import EXCITATIONS, Hidden, excitation, noise_of, sizes_of
 
 LIMITS = ehsvjax.Limits(command=(-8e-3, 8e-3), position=(-0.2, 0.2))
@@ -42,7 +42,7 @@ RIG = Rig(LIMITS.between["command"][1], (SUPPLY[0], Valve().supply_pressure, SUP
 PRESSURE_NOISE = 2.5e9
 VARIANCES = (1e-8, 1e-7, 1e-6)
 # Steps of the plant in which a load pressure is known to a few readings; the position needs none so short.
-FINE_STEP = {True: 2e-5, False: 1e-4}
+FINE_STEP = {True: PRESSURE_STEP, False: SERVOVALVE_STEP}
 
 
 class Trial(NamedTuple):

@@ -14,7 +14,7 @@ from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
 from ehsvjax.diagnosis.decision.examination import Examination, examine
 from ehsvjax.diagnosis.decision.search import select
-from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, Verdict, verdict_of
+from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, Verdict, leaves_something, verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.causes import causes_of
@@ -105,8 +105,7 @@ def _diagnosed(
     if len(records) > 1 and not _explained(verdict.word, examined.innocent, examined.chance):
         alone = _each_alone(fit, records, bank, rng, say)
     disagree = bool(alone) and not _confirmed(verdict, alone)
-    leaves_something = verdict.word == "unexplained" or not examined.innocent
-    if disagree or (leaves_something and gain.worse):
+    if disagree or (leaves_something(verdict.word, examined.innocent) and gain.worse):
         # What explains a part and predicts worse than nothing, or stands for what single records have, is left out
         # again, and all is judged anew.
         examined = examine(selection.without_causes())
@@ -141,7 +140,7 @@ def _diagnosed(
 
 def _explained(word: str, innocent: bool, chance: ProcessNoise | None) -> bool:
     """Whether nothing is left that the bank may lack; a force that was not seen to be chance may be that."""
-    return word != "unexplained" and innocent and (chance is None or chance.settled)
+    return not leaves_something(word, innocent) and (chance is None or chance.settled)
 
 
 def _each_alone(

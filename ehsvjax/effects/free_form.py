@@ -94,7 +94,7 @@ def _needed(form: FreeForm) -> list[int]:
 def effect_of_term(name: str, kind: str, numbers: tuple[str, ...]) -> Effect | None:
     """Return the effect of a term by its name, the kind of its signal and its numbers, which say it all; or None."""
     terms = name.startswith((_TERM, _SHARE)) and all(number.startswith(_AT) for number in numbers)
-    return _effect(name, kind, tuple(numbers)) if terms else None
+    return _effect(name, kind, numbers) if terms else None
 
 
 @functools.cache

@@ -9,10 +9,9 @@ from jaxtyping import Array, Key
 from ehsvjax.checks import by_name, number
 from ehsvjax.diagnosis.bench.workbench import duration_of
 from ehsvjax.diagnosis.results.diagnosis import Diagnosis
-from ehsvjax.diagnosis.results.with_term import with_term
+from ehsvjax.diagnosis.results.with_term import terms_that_act, with_term
 from ehsvjax.effects import BANK, attach
 from ehsvjax.effects.extended import DURATION
-from ehsvjax.effects.free_form import attachable
 from ehsvjax.experiment.plan import Pair
 from ehsvjax.fit import Fit
 from ehsvjax.models.model import Model
@@ -54,13 +53,8 @@ def undecided_of(diagnosis: Diagnosis, key: Key[Array, ""]) -> tuple[dict[str, F
 
 def _terms_of(diagnosis: Diagnosis, key: Key[Array, ""]) -> dict[str, Fit]:
     """Return the forms that a missing term may have, each beside what was found; not those that go by the clock."""
-    missing, plain = diagnosis.missing, diagnosis.extended
-    forms = (missing.form, *missing.alike) if missing is not None and diagnosis.leaves_something else ()
-    some = [form for form in forms if attachable(form, plain.model) is not None][:_MOST]
-    if len(some) < 2:
-        return {}
-    fits = {str(form): with_term(plain, form, key) for form in some}
-    return {name: fit for name, fit in fits.items() if fit is not None}
+    terms = terms_that_act(diagnosis)[:_MOST]
+    return {str(form): with_term(diagnosis.extended, term, key) for form, term in terms} if len(terms) > 1 else {}
 
 
 def doubts_of(diagnosis: Diagnosis, against: Mapping[str, float]) -> tuple[dict[str, Fit], list[Pair]]:

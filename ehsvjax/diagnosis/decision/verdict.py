@@ -53,6 +53,11 @@ UNEXPLAINED = Verdict("unexplained", (), (), ())
 """That something is missing, and nothing is named."""
 
 
+def leaves_something(word: str, innocent: bool) -> bool:
+    """Whether something is left that no cause explains, by the verdict's word and whether what is left is innocent."""
+    return word == "unexplained" or not innocent
+
+
 def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     """Return the verdict, with the causes and what could be there instead.
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 from ehsvjax.diagnosis.decision.search import Integration
-from ehsvjax.diagnosis.decision.verdict import Alternative
+from ehsvjax.diagnosis.decision.verdict import Alternative, leaves_something
 from ehsvjax.diagnosis.hypotheses.missing import MissingTerm
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.causes import Cause, Left
@@ -105,7 +105,7 @@ class Diagnosis:
     @property
     def leaves_something(self) -> bool:
         """Whether something is left that no cause explains: `missing` then acts beside them, else in their place."""
-        return self.verdict == "unexplained" or not self.innocent
+        return leaves_something(self.verdict, self.innocent)
 
     @property
     def left(self) -> Left:
@@ -204,18 +204,19 @@ class Diagnosis:
 
         """
         from ehsvjax.diagnosis.results.with_term import with_term
+        from ehsvjax.effects.free_form import attachable
 
         check_key(key)
         if self.missing is None or not self.leaves_something:
             raise ValueError(f"expected a diagnosis that leaves something, got {self.verdict!r} with no missing term")
-        found = with_term(self.extended, self.missing.form, key)
-        if found is None:
+        term = attachable(self.missing.form, self.extended.model)
+        if term is None:
             raise ValueError(
                 f"expected a missing term that depends on what {self.extended.model.name} passes at "
                 f"{self.missing.place}, got {self.missing.form}: write an effect (ehsvjax.effects.Effect) and diagnose "
                 "again with it in the bank"
             )
-        return found
+        return with_term(self.extended, term, key)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write the diagnosis, its fits and its record included, to one NPZ file without pickled content.

@@ -9,7 +9,7 @@ from ehsvjax.diagnosis.bench.evidence import SIGNIFICANT
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, Size, how_sure
-from ehsvjax.effects.free_form import FreeForm, attachable
+from ehsvjax.diagnosis.results.with_term import terms_that_act
 from ehsvjax.fit import EXPLAINS_NOTHING, at_bounds
 from ehsvjax.models.model import Parameter
 from ehsvjax.quantities import quantity
@@ -329,20 +329,12 @@ def gain_lines(diagnosis: "Diagnosis") -> list[str]:
     return lines
 
 
-def _terms_that_act(diagnosis: "Diagnosis") -> list[FreeForm]:
-    """Return the forms that what is left may have, of those that can act in another record."""
-    missing = diagnosis.missing
-    if missing is None or not diagnosis.leaves_something:
-        return []
-    return [form for form in (missing.form, *missing.alike) if attachable(form, diagnosis.extended.model) is not None]
-
-
 def next_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return what to do next, and what the record excludes."""
     lines = [
         f"to tell {' from '.join(a.causes)}: {a.settled_by}" for a in diagnosis.alternatives if a.settled_by
     ]  # fmt: skip
-    terms = _terms_that_act(diagnosis)
+    terms = terms_that_act(diagnosis)
     if diagnosis.explanations or len(terms) > 1:
         limits = ", ".join(f"{name}=(least, most)" for name in diagnosis.fit.model.inputs)
         lines.append(f"the record that would tell: .next_experiment(ehsvjax.Limits({limits}), key=key)")
@@ -350,7 +342,7 @@ def next_lines(diagnosis: "Diagnosis") -> list[str]:
         lines.append("ask what changed between these records; what each says by itself: .alone")
     elif diagnosis.verdict == "unexplained":
         lines.append("write an effect of that form (ehsvjax.effects.Effect) and diagnose again with it in the bank")
-    if diagnosis.missing is not None and any(form is diagnosis.missing.form for form in terms):
+    if diagnosis.missing is not None and any(form is diagnosis.missing.form for form, _ in terms):
         lines.append("what is missing, identified as it is in the simulation: .with_missing_term(key=key)")
     if diagnosis.verdict == "adequate":
         said = "; ".join(f"{e.cause} above {quantity(e.above, e.unit, digits=2)}" for e in diagnosis.excluded[:_NAMED])
