@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
+from functools import cache
 
 import jax
 import numpy as np
@@ -13,7 +14,7 @@ from ehsvjax.diagnosis.bench.progress import bar as progress_bar
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
 from ehsvjax.diagnosis.decision.examination import Examination, examine
-from ehsvjax.diagnosis.decision.search import select
+from ehsvjax.diagnosis.decision.search import forward, select
 from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, Verdict, leaves_something, verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
@@ -96,16 +97,20 @@ def _diagnosed(
     bench = workbench(replace(fit, model=fit.model.without_priors()), records, bank)
     check_own_effects(bench, bank)
     bench, outliers = _without_spikes(bench)
-    selection = select(bench, say)
+    each_alone = cache(lambda: _each_alone(fit, records, bank, rng, say))
+    looks = forward(bench, say)
+    if looks[-1].leaves_something and any(not one.suspected for one in each_alone()):
+        # Nothing that all share would be confirmed: what they leave together is weighed against nothing at all.
+        looks = looks[:1]
+    say("refitting the rivals", 0.5)
+    selection = select(bench, looks)
     say("testing what is left", 0.8)
     examined = examine(selection)
     nominal = as_fit(examined.selection, selection.nominal, ())
     wider, gain, verdict = _judged(examined, nominal, validation, rng)
-    alone: tuple[Diagnosis, ...] = ()
-    if len(records) > 1 and not _explained(verdict.word, examined.innocent, examined.chance):
-        alone = _each_alone(fit, records, bank, rng, say)
+    alone = () if _explained(verdict.word, examined.innocent, examined.chance) else each_alone()
     disagree = bool(alone) and not _confirmed(verdict, alone)
-    if disagree or (leaves_something(verdict.word, examined.innocent) and gain.worse):
+    if selection.included and (disagree or (leaves_something(verdict.word, examined.innocent) and gain.worse)):
         # What explains a part and predicts worse than nothing, or stands for what single records have, is left out
         # again, and all is judged anew.
         examined = examine(selection.without_causes())
@@ -146,8 +151,10 @@ def _explained(word: str, innocent: bool, chance: ProcessNoise | None) -> bool:
 def _each_alone(
     fit: Fit, records: tuple[Record, ...], bank: tuple[Effect, ...], rng: np.random.Generator, say: Progress
 ) -> tuple[Diagnosis, ...]:
-    """Diagnose each record by itself; return nothing if one of them is not explained by itself either."""
+    """Diagnose each of several by itself; return nothing if one of them is not explained by itself either."""
     found: list[Diagnosis] = []
+    if len(records) == 1:
+        return ()
     for record in records:
         one = _diagnosed(fit, (record,), (), bank, rng, say)
         if not _explained(one.verdict, one.innocent, one.process_noise):

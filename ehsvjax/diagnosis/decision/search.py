@@ -13,7 +13,7 @@ from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, not_made_up_for
-from ehsvjax.diagnosis.bench.workbench import Workbench, same_readings, settled, with_readings
+from ehsvjax.diagnosis.bench.workbench import Workbench, same_readings, settled
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
 from ehsvjax.diagnosis.decision.trials import (
@@ -46,6 +46,11 @@ class Stage(NamedTuple):
     current: Refits
     noise: Noise
     screening: Screening
+
+    @property
+    def leaves_something(self) -> bool:
+        """Whether a candidate is significant on what is left."""
+        return bool(self.screening.ranked) and self.screening.ranked[0].corrected < SIGNIFICANT
 
 
 class Integration(NamedTuple):
@@ -126,8 +131,8 @@ class Selection:
         return replace(self, included=(), final=self.nominal, rivals=(), needs=(), unused=unused)
 
 
-def select(bench: Workbench, progress: Progress) -> Selection:
-    """Search for the causes of what a fit leaves of a record.
+def forward(bench: Workbench, progress: Progress) -> tuple[Stage, ...]:
+    """Add the cause that explains most, refit and look again, until nothing gains enough; return the looks.
 
     Args:
         bench: the fit and the record.
@@ -140,24 +145,34 @@ def select(bench: Workbench, progress: Progress) -> Selection:
     stages = [_look(trials, (), refit_set(trials, bench.nominal, (), plain), plain)]
     while (found := _next_effect(stages[-1])) is not None:
         stages.append(found)
-    progress("refitting the rivals", 0.5)
-    looked_beside = {frozenset(stage.included) for stage in stages}
-    last = stages.pop()
-    nominal = stages[0].current if stages else last.current
+    return tuple(stages)
+
+
+def select(bench: Workbench, found: Sequence[Stage]) -> Selection:
+    """Weigh the causes of the last of some looks against their rivals, and go on from what comes out of that.
+
+    Args:
+        bench: the fit and the record, as the looks began.
+        found: the looks, the first at the nominal model.
+
+    """
+    looked_beside = {frozenset(stage.included) for stage in found}
+    *stages, last = found
+    nominal = found[0].current
     weighed = _weighed(last, nominal)
     while True:
         last = weighed.stage
         if weighed.needless is not None:
             # What was added first can become needless by what was added later.
-            found = _look_without(last, [weighed.needless])
+            look: Stage | None = _look_without(last, [weighed.needless])
         elif frozenset(last.included) not in looked_beside and len(looked_beside) <= len(stages) + _ROUNDS:
             # Beside what was swapped in, or without what was needless, something else may explain the rest.
             looked_beside.add(frozenset(last.included))
-            found = _next_effect(last)
+            look = _next_effect(last)
         else:
             break
-        if found is not None:
-            weighed = _weighed(found, nominal)
+        if look is not None:
+            weighed = _weighed(look, nominal)
     return _selection(bench, stages, weighed)
 
 
@@ -230,7 +245,7 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
         if not rounds_left or (known is trials.bench and frozenset(included) in looked_at):
             break
         # Nothing is searched again: what was found is refitted from where it is, under the noise that is left now.
-        stage = _look(trials._replace(bench=known), included, final, noise)
+        stage = _look(trials._replace(bench=known), included, final, noise, int(known.problem.substeps))
         looked_at.add(frozenset(included))
         included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
     needs, unused = _needs(stage, nominal)
@@ -309,10 +324,16 @@ def required_gain(bench: Workbench, screening: Screening, candidate: int) -> flo
     return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
 
 
-def _look(trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise) -> Stage:
-    """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest."""
-    # Where jumps lie, and what arithmetic knows, is another matter for every explanation.
-    every = with_readings(trials.bench, trials.readings)
+def _look(
+    trials: Trials, included: tuple[int, ...], current: Refits, noise: Noise, substeps: int | None = None
+) -> Stage:
+    """Look at what is left after a refit: its noise, first taken to be as before, and what could explain the rest.
+
+    With at least so many steps a sample, or as many as the refit itself needs.
+    """
+    every = trials.begun
+    if substeps is not None:
+        every = replace(every, problem=replace(every.problem, substeps=np.int32(substeps)))
     trials, current = _known(trials, every, included, current, noise)
     while True:
         bench = trials.bench
@@ -397,20 +418,14 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
             break
         candidate = some[chosen].candidate
         best = _look(trials, (*stage.included, candidate), refitted.of([chosen]), stage.noise)
-        if not _leaves_something(best):
+        if not best.leaves_something:
             break
         reshaped = refit_reshaped(best.trials, best.current, best.included, candidate, best.noise)
         if reshaped is not best.current:
             best = _look(best.trials, best.included, reshaped, best.noise)
-            if not _leaves_something(best):
+            if not best.leaves_something:
                 break
     return best
-
-
-def _leaves_something(stage: Stage) -> bool:
-    """Whether a candidate is significant on what a stage leaves."""
-    left = stage.screening.ranked
-    return bool(left) and left[0].corrected < SIGNIFICANT
 
 
 def _cost_under(refits: Refits, noise: Noise) -> float:

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.progress import Progress
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit, span
-from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench, prepared
+from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench, prepared, with_readings
 from ehsvjax.diagnosis.hypotheses.curves import Terms, every_curve, quantities, terms_at
 from ehsvjax.diagnosis.hypotheses.harmonics import Waves, waves_of
 from ehsvjax.diagnosis.hypotheses.screening import Screened
@@ -35,7 +35,8 @@ class Trials(NamedTuple):
         seen: what runs along the nominal model and varies, by name.
         terms: of free form, at all places, and what they would do to the outputs of the nominal model.
         waves: what harmonic effects would do, by the candidate's name.
-        readings: all that carry weight where arithmetic knows them and no jump is near: each look finds these itself.
+        begun: the workbench that each look begins with: at the nominal model's step, with all readings. What arithmetic
+            another explanation needs, and where its jumps lie, the look finds itself.
         reached: set of effects -> the point to which its last refit has led; grows as the search goes on.
         progress: told of each stage.
 
@@ -45,7 +46,7 @@ class Trials(NamedTuple):
     seen: dict[str, Float[np.ndarray, "record time"]]
     terms: Terms
     waves: dict[str, Waves]
-    readings: Bool[np.ndarray, "record time signal"]
+    begun: Workbench
     reached: dict[frozenset[int], Float[np.ndarray, " parameter"]]
     progress: Progress
 
@@ -55,7 +56,8 @@ def trials_of(begun: Workbench, progress: Progress) -> Trials:
     bench = prepared(begun)
     seen = quantities(bench)
     terms = terms_at(bench, bench.nominal, every_curve(bench, seen))
-    return Trials(bench, seen, terms, waves_of(bench), begun.problem.samples.measured, {}, progress)
+    every = with_readings(bench, begun.problem.samples.measured)
+    return Trials(bench, seen, terms, waves_of(bench), every, {}, progress)
 
 
 def most_unknowns(bench: Workbench) -> int:
