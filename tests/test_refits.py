@@ -43,3 +43,30 @@ def test_a_start_that_a_kink_holds_up_is_not_given_up_beside_the_best(race):
     found = refit(Bent(), np.array([[0.0], [AT_THE_READING]]), np.zeros((2, 1), int), noise, race=race)
     assert found.cost == pytest.approx([0.0, 0.0], abs=1e-6)
     assert found.points[:, 0] == pytest.approx([AT_THE_READING, AT_THE_READING])
+
+
+class Watched(Bent):
+    """The same bench, which remembers where it was asked for derivatives."""
+
+    def __init__(self):
+        super().__init__()
+        object.__setattr__(self, "asked", [])
+
+    def linearised(self, points, chosen):
+        self.asked.append(float(points[0, 0]))
+        return super().linearised(points, chosen)
+
+
+def test_a_step_that_failed_is_at_least_halved_however_little_was_damped():
+    bench, noise = Watched(), plain_noise(np.ones(1), np.ones(LAST.shape, bool))
+    # Good steps along the flat side first: they leave the next one all but undamped.
+    refit(bench, np.array([[-1e6]]), np.zeros((1, 1), int), noise)
+    cost = [(READING - bench.simulated(np.array([[x]]))[0, 0, 999, 0]) ** 2 for x in bench.asked]
+    best, failed = 0, 0
+    for k in range(1, len(cost)):
+        if cost[k] < cost[best]:
+            best = k
+        elif k + 1 < len(cost) and best < k:
+            failed += 1
+            assert abs(bench.asked[k + 1] - bench.asked[best]) <= 0.501 * abs(bench.asked[k] - bench.asked[best])
+    assert failed >= 3

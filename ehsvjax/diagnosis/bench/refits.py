@@ -16,6 +16,8 @@ _ITERATIONS = 60
 _HOPELESS = 5.0
 _PATIENCE = 4
 _STEEPEST = 1e100
+# By which damping falls after a good step, and is raised until a bad one is halved; and where no step is left.
+_EASED, _DAMPED, _MOST_DAMPED = 0.1, 4.0, 1e12
 # How many times as long the steps are at which a refit begins where that many times as many are not few.
 _COARSER = 8
 # Share of a step at which its curvature is taken, and of the step that its acceleration may be.
@@ -111,9 +113,10 @@ def refit(
 ) -> Refits:
     """Refit the chosen unknowns of every start.
 
-    Damping is relative to the diagonal and grows by 2, 4, 8, ... for steps in a row that did not lower the cost
-    (Nielsen 1999); an unknown at a bound that the gradient pushes outwards is held there. Steps bend with the valley
-    that they follow (geodesic acceleration, Transtrum & Sethna 2012, arXiv 1201.5885), which takes one more simulation.
+    Damping is relative to the diagonal. After a step that did not lower the cost it grows until the next is at most
+    half as long: after good steps it is so small that factors of it would change nothing. An unknown at a bound that
+    the gradient pushes outwards is held there. Steps bend with the valley that they follow (geodesic acceleration,
+    Transtrum & Sethna 2012, arXiv 1201.5885), which takes one more simulation.
 
     Args:
         bench: the trials' workbench.
@@ -133,7 +136,7 @@ def refit(
     kept: list[_Here | None] = [None] * count
     # Of all starts at once: of a long record by far the most that there is to remember.
     every_slope = np.zeros((count, width, *readings.shape))
-    damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
+    damping, longest = np.full(count, 1e-4), np.full(count, np.inf)
     cost = np.full(count, np.inf)
     converged, hopeless = np.zeros(count, bool), np.zeros(count, int)
     running, bending = np.ones(count, bool), np.ones(count, bool)
@@ -154,21 +157,25 @@ def refit(
                 points[i], cost[i] = trial[i], value
                 every_slope[i, chosen[i] >= 0] = slopes[chosen[i] >= 0]
                 kept[i] = _Here(residual, every_slope[i], jacobian @ scaled, jacobian @ jacobian.T)
-                damping[i], growth[i] = 0.1 * damping[i], 2.0
-            else:
-                damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
+                damping[i], longest[i] = _EASED * damping[i], np.inf
             here = kept[i]
             if here is None:
                 running[i] = False
                 continue
-            step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
+            while True:
+                step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
+                length = np.linalg.norm(np.sqrt(np.diag(here.information)) * step[np.maximum(chosen[i], 0)])
+                if length <= longest[i] or damping[i] > _MOST_DAMPED:
+                    break
+                damping[i] *= _DAMPED
+            longest[i] = 0.5 * length
             variance = max(cost[i] / len(scaled), 1e-300)
             bending[i] = gain > variance
             if gain < 0.01 * variance:
                 converged[i] = True
                 running[i] = False
             hopeless[i] = hopeless[i] + 1 if _HOPELESS * gain < cost[i] - np.min(cost) else 0
-            if damping[i] > 1e12 or (race and hopeless[i] >= _PATIENCE):
+            if damping[i] > _MOST_DAMPED or (race and hopeless[i] >= _PATIENCE):
                 running[i] = False
             trial[i] = points[i] + step
         # Near the minimum no valley is left to follow.
