@@ -9,6 +9,7 @@ import pytest
 
 import ehsvjax
 from ehsvjax.diagnosis import Diagnosis, diagnose
+from ehsvjax.diagnosis.decision import search
 from tests.hidden_plants import held_levels, servovalve_with, van_der_pol_with
 from tests.small_models import STIFFNESS, carriage, carriage_plant, record_of
 
@@ -135,8 +136,15 @@ def test_a_periodic_force_has_an_amplitude_of_its_own_in_every_record():
 
 
 @of_the_oscillator
-def test_what_one_record_alone_has_is_named_of_that_record(tmp_path):
-    """Together a parameter that changed, certain, and a random force stood for it."""
+def test_what_one_record_alone_has_is_named_of_that_record(tmp_path, monkeypatch):
+    """Together a parameter that changed, certain, and a random force stood for it; their rivals took half an hour."""
+    weighed, weigh = [], search.rivals_of_all
+
+    def watched(trials, included, *rest):
+        weighed.append((len(trials.bench.records), included))
+        return weigh(trials, included, *rest)
+
+    monkeypatch.setattr(search, "rivals_of_all", watched)
     limited = {"input_saturation": {"limit": 0.6}}
     records = [
         oscillation(1, 15, 50, 0.02, 1e-2, "plain"),
@@ -146,6 +154,7 @@ def test_what_one_record_alone_has_is_named_of_that_record(tmp_path):
     assert (found.verdict, found.names, found.alternatives) == ("unexplained", (), ()), str(found)
     assert [(one.verdict, one.names) for one in found.alone] == [("adequate", ()), ("named", ("input_saturation",))]
     assert [one.records for one in found.alone] == [(record,) for record in records]
+    assert [included for count, included in weighed if count == 2] == [()]
     assert found.alone[1].extended.parameters["input_saturation.limit"] == pytest.approx(0.6, rel=0.02)
     said = str(found).splitlines()[0]
     assert "the records disagree" in said and "plain by itself: adequate; limited by itself: input_saturation (" in said

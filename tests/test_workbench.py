@@ -247,6 +247,20 @@ def test_a_single_cause_that_the_record_can_do_without_is_needless(bench):
     assert weighed.stage.included == (weighed.needless,), weighed.needs
 
 
+def test_a_look_begins_at_the_nominal_models_step_whatever_was_tried_before(bench):
+    """A wave that needed many steps a sample left them to all that was tried after it."""
+    trials = trials_of(bench, lambda stage: None)
+    noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
+    problem = trials.begun.problem
+    fine = replace(trials.begun, problem=replace(problem, substeps=np.int32(16 * problem.substeps)))
+    after = trials._replace(bench=fine)
+    nominal = refit_sets(after, [[bench.nominal]], [()], noise)
+    assert _look(after, (), nominal, noise).trials.bench.problem.substeps == problem.substeps
+    # What is compared with what needs more has as many.
+    as_fine = int(fine.problem.substeps)
+    assert _look(after, (), nominal, noise, as_fine).trials.bench.problem.substeps == as_fine
+
+
 def test_what_has_taken_one_causes_place_is_no_rival_of_another(bench):
     """Else an explanation has it twice, and no such model can be made."""
     names = [c.name for c in bench.candidates]

@@ -79,14 +79,16 @@ def examine(selection: Selection) -> Examination:
     force = process_noise(bench, selection.final, noise)
     chance, chance_behind = None, (np.inf,) * len(selection.included)
     if force is not None:
+        # What no test sees must be there by the likelihood alone.
+        needed = 0.0 if _significant(after) else -2.0 * float(np.log(SIGNIFICANT))
+        chance = _chance_in(selection, selection.final, force, after, needed)
         instead_of = _chance_instead(selection, force)
         least = min(instead_of, key=lambda causes: instead_of[causes], default=())
         if least and instead_of[least] < 0.0:
             rest = examine(without(selection, least))
-            return rest._replace(doubted=rest.doubted | _doubted(selection, least, -instead_of[least]))
-        # What no test sees must be there by the likelihood alone.
-        needed = 0.0 if _significant(after) else -2.0 * float(np.log(SIGNIFICANT))
-        chance = _chance_in(selection, selection.final, force, after, needed)
+            # Where chance is there beside them as well, they are needless; else chance or they are there.
+            doubted = {} if chance is not None else _doubted(selection, least, -instead_of[least])
+            return rest._replace(doubted=rest.doubted | doubted)
         chance_behind = tuple(
             min((behind for causes, behind in instead_of.items() if cause in causes), default=np.inf)
             for cause in selection.included
