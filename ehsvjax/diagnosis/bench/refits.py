@@ -11,10 +11,10 @@ from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
 from ehsvjax.diagnosis.bench.workbench import ABREAST, TOLD_APART, Workbench
 
 _ITERATIONS = 60
-# A start is given up if so many steps like the next would not bring it to the best, so many times in a row: a kink
-# makes some of them short, until damping has grown and shrunk again.
+# A start is given up if so many steps like the next would not bring it to the best, behind so many good ones in a row:
+# a kink makes some of them short, until damping has grown and shrunk again.
 _HOPELESS = 5.0
-_PATIENCE = 4
+_PATIENCE = 2
 _STEEPEST = 1e100
 # By which damping falls after a good step, and is raised until a bad one is halved; and where no step is left.
 _EASED, _DAMPED, _MOST_DAMPED = 0.1, 4.0, 1e12
@@ -162,6 +162,7 @@ def refit(
             if here is None:
                 running[i] = False
                 continue
+            failed = longest[i] < np.inf
             while True:
                 step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
                 length = np.linalg.norm(np.sqrt(np.diag(here.information)) * step[np.maximum(chosen[i], 0)])
@@ -174,7 +175,8 @@ def refit(
             if gain < 0.01 * variance:
                 converged[i] = True
                 running[i] = False
-            hopeless[i] = hopeless[i] + 1 if _HOPELESS * gain < cost[i] - np.min(cost) else 0
+            if not failed:
+                hopeless[i] = hopeless[i] + 1 if _HOPELESS * gain < cost[i] - np.min(cost) else 0
             if damping[i] > _MOST_DAMPED or (race and hopeless[i] >= _PATIENCE):
                 running[i] = False
             trial[i] = points[i] + step
