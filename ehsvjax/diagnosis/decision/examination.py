@@ -33,7 +33,8 @@ class Examination(NamedTuple):
         chance: the random force that explains what the causes leave; None if none does.
         chance_behind: of each cause, noise variances by which a random force in its place, or in that of all, is
             behind, less what chance would gain with what it stands for; infinite where none is about as likely.
-        doubted: of those, and of what could be there instead of each, by how many noise variances it is behind chance.
+        doubted: of those beside which no chance is left, and of what could be there instead of each, by how many noise
+            variances it is behind chance.
         left: a term of free form in what the causes leave; None where that is nothing, or chance.
         instead: one term of free form that explains the record as well as all causes together and what they leave, but
             for the price of its pieces; looked for beside several, or where they leave something; None if none does.
