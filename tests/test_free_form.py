@@ -171,3 +171,11 @@ def test_a_plan_tells_apart_what_a_missing_term_may_be(found):
 def test_one_form_alone_leaves_nothing_to_tell_apart(found):
     with pytest.raises(ValueError, match=r"expected a diagnosis with causes that the records cannot tell apart"):
         found.next_experiment(ehsvjax.Limits(push=(-6.0, 6.0)), key=KEY)
+
+
+def test_limits_are_refused_before_any_form_is_identified(found, monkeypatch):
+    monkeypatch.setattr("ehsvjax.experiment.questions.with_term", lambda *_: pytest.fail("identified first"))
+    sensor = FreeForm("position", "position", np.array([-1.0, 1.0]), np.zeros(2), False)
+    either = dataclasses.replace(found, missing=found.missing._replace(alike=(sensor,)))
+    with pytest.raises(ValueError, match=r"expected limits of every input, got none of push"):
+        either.next_experiment(ehsvjax.Limits(position=(-1.0, 1.0)), key=KEY)

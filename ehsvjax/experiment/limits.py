@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-from ehsvjax.checks import by_name, number, positive
+from ehsvjax.checks import by_name, instance, number, positive
+from ehsvjax.models.model import Model
 
 
 class Limits:
@@ -45,6 +46,30 @@ class Limits:
         given |= {"rates": self.rates} if self.rates else {}
         given |= {} if self.duration is None else {"duration": self.duration}
         return f"Limits({', '.join(f'{name}={value!r}' for name, value in given.items())})"
+
+
+def check_limits(limits: Limits, model: Model) -> None:
+    """Check that limits are those of a model.
+
+    Raises:
+        ValueError: for what is no limits, an input without them, or a name that the model does not have.
+
+    """
+    instance("limits", limits, Limits, "make them by ehsvjax.Limits(command=(-5e-3, 5e-3))")
+    for name in limits.between:
+        if name not in (*model.inputs, *model.outputs):
+            raise ValueError(
+                f"expected limits of inputs and outputs of {model.name}, {', '.join((*model.inputs, *model.outputs))}; "
+                f"got {name!r}"
+            )
+    for name in limits.rates:
+        if name not in model.inputs:
+            raise ValueError(f"expected rates of inputs of {model.name}, {', '.join(model.inputs)}; got {name!r}")
+    missing = [name for name in model.inputs if name not in limits.between]
+    if missing:
+        raise ValueError(
+            f"expected limits of every input, got none of {', '.join(missing)}: Limits({missing[0]}=(...))"
+        )
 
 
 def as_pair(name: str, pair: Any) -> tuple[float, float]:

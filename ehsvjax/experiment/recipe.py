@@ -9,7 +9,7 @@ from jaxtyping import Array, Key
 
 from ehsvjax.checks import by_name, instance, several, whole
 from ehsvjax.draws import check_key
-from ehsvjax.experiment.limits import Limits, as_pair
+from ehsvjax.experiment.limits import Limits, as_pair, check_limits
 from ehsvjax.experiment.options import Question, options_of, separated
 from ehsvjax.experiment.plan import Option, Pair, Plan, best_of, ranked
 from ehsvjax.experiment.separation import as_said_so_far
@@ -58,7 +58,8 @@ def next_experiment(
             model does not have, or limits, variances and numbers that are none.
 
     """
-    fits = _checked(explanations, limits)
+    fits = _checked(explanations)
+    check_limits(limits, next(iter(fits.values())).model)
     check_key(key)
     apart = _apart(fits, pairs)
     first = next(iter(fits.values()))
@@ -102,33 +103,17 @@ def next_experiment(
     )
 
 
-def _checked(explanations, limits) -> dict[str, Fit]:
+def _checked(explanations) -> dict[str, Fit]:
     fits = by_name("explanations", explanations, "{'nothing': fit, 'coulomb_friction': other_fit}")
     several("explanations", tuple(fits.values()), Fit, "fits as identify returns them")
     if len(fits) < 2:
         raise ValueError(f"expected two explanations or more to tell apart, got {', '.join(fits) or 'none'}")
-    instance("limits", limits, Limits, "make them by ehsvjax.Limits(command=(-5e-3, 5e-3))")
     first = next(iter(fits.values()))
     for name, fit in fits.items():
         if len(fit.records) != len(first.records) or any(
             len(a) != len(b) for a, b in zip(fit.records, first.records, strict=True)
         ):
             raise ValueError(f"expected explanations that were fitted to the same records; those of {name} are others")
-    model = first.model
-    for name in limits.between:
-        if name not in (*model.inputs, *model.outputs):
-            raise ValueError(
-                f"expected limits of inputs and outputs of {model.name}, {', '.join((*model.inputs, *model.outputs))}; "
-                f"got {name!r}"
-            )
-    for name in limits.rates:
-        if name not in model.inputs:
-            raise ValueError(f"expected rates of inputs of {model.name}, {', '.join(model.inputs)}; got {name!r}")
-    missing = [name for name in model.inputs if name not in limits.between]
-    if missing:
-        raise ValueError(
-            f"expected limits of every input, got none of {', '.join(missing)}: Limits({missing[0]}=(...))"
-        )
     return fits
 
 

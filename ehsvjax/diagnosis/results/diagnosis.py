@@ -181,8 +181,12 @@ class Diagnosis:
 
         """
         from ehsvjax.experiment import next_experiment
+        from ehsvjax.experiment.limits import check_limits
         from ehsvjax.experiment.questions import doubts_of, undecided_of
 
+        # Before anything is identified.
+        check_limits(limits, self.fit.model)
+        check_key(key)
         explanations, pairs = undecided_of(self, key) if against is None else doubts_of(self, against)
         return next_experiment(
             explanations, limits, key=key, can_change=can_change, can_add=can_add, records=records, own=own,
