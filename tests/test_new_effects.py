@@ -38,10 +38,6 @@ def diagnosed(model, record):
     return diagnose(fit, record, key=KEY)
 
 
-def suspected(found) -> set[str]:
-    return {*found.names, *(name for group in found.alternatives for name in group.causes)}
-
-
 # --- A tank that overflows ---
 
 PERIOD_OF_TANKS, BRIM = 0.5, 4.0
@@ -61,7 +57,7 @@ def overflowing():
 
 
 def test_a_tank_that_overflows_has_a_hard_limit(overflowing):
-    assert "hard_limit" in suspected(overflowing), str(overflowing)
+    assert "hard_limit" in overflowing.suspected, str(overflowing)
     assert len(overflowing.names) == 1
     name = "hard_limit.positive_limit"
     found, error = (of[name] for of in (overflowing.extended.parameters, overflowing.extended.standard_errors))
@@ -101,7 +97,7 @@ def test_an_input_that_runs_straight_from_value_to_value_is_a_hold():
     position = carriage_plant(push, PERIOD, straight=True)[:, 0]
     held = record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 5)
     found = diagnosed(carriage(), held)
-    assert "input_hold" in suspected(found), str(found)
+    assert "input_hold" in found.suspected, str(found)
     if "input_hold" in found.names:
         assert found.extended.parameters["input_hold.share"] == pytest.approx(1.0, abs=0.1)
     # Declared as it is, nothing is missing.

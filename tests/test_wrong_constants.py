@@ -36,10 +36,6 @@ def diagnosed(model, position, seed):
     return diagnose(fit, record, key=KEY)
 
 
-def suspected(found) -> set[str]:
-    return {*found.names, *(name for group in found.alternatives for name in group.causes)}
-
-
 @pytest.fixture(scope="module")
 def softer():
     return diagnosed(carriage(), carriage_plant(PUSH, PERIOD, stiffness=1.5 * STIFFNESS)[:, 0], seed=1)
@@ -47,7 +43,7 @@ def softer():
 
 @of_a_carriage
 def test_a_constant_that_is_off_is_in_one_group_with_what_looks_the_same(softer):
-    assert suspected(softer) == {"stiffness", "linear_stiffness"}, str(softer)
+    assert softer.suspected == {"stiffness", "linear_stiffness"}, str(softer)
     # The same as more of a spring at the force: no record tells them apart.
     assert softer.verdict == "ambiguous"
     settled_by = next(group.settled_by for group in softer.alternatives)
@@ -71,7 +67,7 @@ def test_what_is_certain_is_no_candidate(softer):
 def test_a_constant_that_is_certain_is_not_blamed_though_it_is_off():
     found = diagnosed(carriage(mass=1.3 * MASS), carriage_plant(PUSH, PERIOD)[:, 0], seed=2)
     assert found.verdict != "adequate"
-    assert "mass" not in suspected(found), str(found)
+    assert "mass" not in found.suspected, str(found)
 
 
 def of_mass(given: float, **bounds) -> ehsvjax.Model:
@@ -142,7 +138,7 @@ def test_a_parameter_that_acts_beyond_its_bounds_only_is_found():
     model = carriage()
     model = replace(model, parameters=(*model.parameters, highest), stepper=runge_kutta_4(limited))
     found = diagnosed(model, carriage_plant(np.clip(PUSH, -8.0, 8.0), PERIOD)[:, 0], seed=15)
-    assert suspected(found) == {"highest", "input_saturation"}, str(found)
+    assert found.suspected == {"highest", "input_saturation"}, str(found)
     assert found.fit.parameters["highest"] * (1.0 + found.extended.parameters["highest.error"]) == pytest.approx(
         8.0, rel=0.01
     )
@@ -187,6 +183,6 @@ def test_a_stiffness_given_at_half_of_what_it_is_is_found_from_the_position_alon
     )
     found = diagnose(fit, record, key=KEY)
     # The position shows the load's pressure over the supply's alone: twice the stiffness is half of area or supply.
-    assert "stiffness" in suspected(found), str(found)
+    assert "stiffness" in found.suspected, str(found)
     assert found.names[0] in ("stiffness", "piston_area", "supply_pressure"), str(found)
     assert len(found.names) == 1 and found.innocent
