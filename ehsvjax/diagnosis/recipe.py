@@ -110,9 +110,10 @@ def _diagnosed(
     wider, gain, verdict = _judged(examined, nominal, validation, rng)
     alone = () if _explained(verdict.word, examined.innocent, examined.chance) else each_alone()
     disagree = bool(alone) and not _confirmed(verdict, alone)
-    if selection.included and (disagree or (leaves_something(verdict.word, examined.innocent) and gain.worse)):
-        # What explains a part and predicts worse than nothing, or stands for what single records have, is left out
-        # again, and all is judged anew.
+    worse = gain.worse and not examined.innocent
+    if selection.included and (disagree or worse or verdict is UNEXPLAINED):
+        # What explains a part and predicts worse than nothing, stands for what single records have, or has not earned
+        # its place beside what is missing, is left out again, and all is judged anew.
         examined = examine(selection.without_causes())
         wider, gain, verdict = _judged(examined, nominal, validation, rng)
     if disagree:

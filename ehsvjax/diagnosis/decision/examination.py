@@ -204,12 +204,16 @@ def _instead(
         return None, False
     bench, noise, nominal = selection.bench, selection.noise, selection.nominal
     term, curve = missing_term(bench, nominal, noise, selection.seen, _suspects(before))
-    # What they leave has a term of its own where that earns its price.
-    beside = [(selection.final.residual[0], 0.0), *([] if left is None else [(left.residual, left.pieces)])]
-    better = min(noise.gained(residual, term.residual) + _bayes_price(noise, pieces) for residual, pieces in beside)
-    better += sum(_price(selection, i) for i in causes)
+    better = noise.gained(selection.final.residual[0], term.residual) + sum(_price(selection, i) for i in causes)
+    least = INSEPARABLE
+    if left is not None:
+        # Beside a term in what they leave they must gain what they had to gain beside nothing.
+        required = sum(need.required for need in selection.needs)
+        beside = noise.gained(left.residual, term.residual) + _bayes_price(noise, left.pieces) + required
+        better, least = min((better, INSEPARABLE), (beside, 0.0), key=lambda pair: pair[0] - pair[1])
+    better -= _bayes_price(noise, term.pieces)
     of_run = any(bench.candidates[i].effect.of_run for i in causes)
-    if (term.quantity == TIME and not of_run) or not better > _bayes_price(noise, term.pieces) + INSEPARABLE:
+    if (term.quantity == TIME and not of_run) or not better > least:
         return (term if better > -INSEPARABLE else None), False
     if term.quantity == TIME:
         return term, True
