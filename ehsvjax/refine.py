@@ -108,14 +108,17 @@ def gauss_newton_step(
 ) -> Float[Array, " parameter"]:
     """Return the damped Gauss-Newton step within the coordinates that are free to move.
 
-    Directions that the data do not fix (eigenvalues of the scaled information at rounding level) are left alone.
+    What the data do not fix is left alone: directions (eigenvalues of the scaled information at rounding level), and
+    coordinates of which nothing but rounding shows, which would go from one bound to the other however much is damped.
     """
+    eps = jnp.finfo(point.dtype).eps
     pushed_out = ((point <= 0.0) & (gradient > 0.0)) | ((point >= 1.0) & (gradient < 0.0))
     diagonal = jnp.diagonal(information)
-    scale = jnp.where(pushed_out | (diagonal <= 0.0), 0.0, lax.rsqrt(jnp.where(diagonal > 0.0, diagonal, 1.0)))
+    shows = diagonal > eps**2 * jnp.max(diagonal)
+    scale = jnp.where(pushed_out | ~shows, 0.0, lax.rsqrt(jnp.where(shows, diagonal, 1.0)))
     scaled = information * scale[:, None] * scale[None, :]
     values, vectors = jnp.linalg.eigh(scaled)
-    fixed_by_data = values > len(point) * jnp.finfo(point.dtype).eps * values[-1]
+    fixed_by_data = values > len(point) * eps * values[-1]
     inverse = jnp.where(fixed_by_data, 1.0 / (jnp.where(fixed_by_data, values, 1.0) + damping), 0.0)
     return -scale * (vectors @ (inverse * (vectors.T @ (scale * gradient))))
 

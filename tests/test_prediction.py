@@ -170,3 +170,16 @@ def test_causes_predict_worse_where_some_output_is_worse_and_none_is_surely_bett
         for k, (before, after, share) in enumerate(outputs)
     }
     assert Gain(gains, (), (), "", (), ()).worse == worse
+
+
+@pytest.mark.thorough
+def test_a_cause_that_gains_nothing_beside_what_is_missing_is_not_named():
+    """A notch of the orifice, which no effect of the bank has: a sensor's bias, and seven others, stood beside it."""
+    (hidden,) = records([Hidden("servovalve", "white", 1e-8, ("unknown_spool_notch",), 656672596)])
+    record = ehsvjax.Record(hidden.time, {"command": hidden.command}, {"position": hidden.position})
+    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=KEY, population=50, generations=20)
+    found = ehsvjax.diagnose(fit, record, key=KEY)
+    assert (found.verdict, found.suspected) == ("unexplained", set()), str(found)
+    assert (found.missing.place, found.missing.quantity) == ("opening", "opening")
+    # Nor does the extended model have it.
+    assert not set(found.extended.parameters) - set(fit.parameters)

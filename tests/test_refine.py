@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 import ehsvjax
 from ehsvjax.population import cast, to_values
-from ehsvjax.refine import cost_gradient_information, refine
+from ehsvjax.refine import cost_gradient_information, gauss_newton_step, refine
 from ehsvjax.unknowns import problem_of
 from tests import plants
 
@@ -132,3 +132,15 @@ def test_a_start_from_which_every_simulation_fails_is_never_converged():
     result, _ = _refined(problem, [[0.5, 0.5, 0.5, 0.5]], iterations=5)
     assert not result.converged[0]
     assert np.isinf(result.cost[0])
+
+
+def test_what_shows_in_rounding_alone_is_not_moved():
+    """It would go from bound to bound at any damping: a refinement took its start for the minimum."""
+    slopes = np.array([[3.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1e-17]])
+    information, gradient = slopes.T @ slopes, slopes.T @ np.array([0.3, -0.2, 5.0])
+    with jax.enable_x64(True):
+        for damping in (0.0, 1e-4, 1e3):
+            step = gauss_newton_step(jnp.full(3, 0.5), jnp.asarray(gradient), jnp.asarray(information), damping)
+            rest = np.diag(information)[:2]
+            expected = -np.linalg.solve(information[:2, :2] + damping * np.diag(rest), gradient[:2])
+            np.testing.assert_allclose(step, [*expected, 0.0], rtol=1e-9, atol=0.0)
