@@ -5,7 +5,8 @@ simulated once only. Frequencies too high for the parts are looked for in the re
 themselves, their own frequency and its multiples are left out: what goes by them a nonlinear model makes of its inputs.
 """
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -159,30 +160,34 @@ def _shares(bench: Workbench, candidate: Candidate, frequencies, parts: Parts):
     amplitudes = [n for n in numbers if n.absent is not None]
     absent = {n.name: n.absent if n.absent is not None else n.tries(scales)[0] for n in numbers}
     internal = bench.internal
-    context = {**internal.contexts[candidate.signal], "time": bench.clock}
     always = {"step_size": float(np.min(bench.problem.samples.sample_period)), "duration": scales["duration"]}
-
-    def added(own, value, along):
-        return candidate.effect.apply(own, value, along | always) - value
-
+    every = _every(candidate.effect.apply)
+    # Some at a time: of a long record all of them take more memory than all else. The last are filled up.
+    blocks = np.resize(frequencies, (max(1, -(-len(frequencies) // AT_ONCE)), AT_ONCE))
     with kernels.double_precision():
-        every_time = jax.vmap(jax.vmap(added, in_axes=(None, 0, 0)), in_axes=(None, 0, 0))
-        every = jax.vmap(
-            every_time, in_axes=({n.name: 0 if n.name == "frequency" else None for n in numbers}, None, None)
-        )
         value = jnp.asarray(internal.values[candidate.signal])
+        context = {**internal.contexts[candidate.signal], "time": bench.clock}
         along = {name: jnp.asarray(series) for name, series in context.items()}
 
-        def means_of(amplitude, some):
-            own = {**absent, amplitude.name: amplitude.tries(scales)[0], "frequency": jnp.asarray(some)}
-            return parts.means(np.asarray(every(own, value, along)))
+        def means_of(amplitude):
+            own = {**absent, amplitude.name: amplitude.tries(scales)[0]}
+            return np.concatenate([parts.means(np.asarray(every(own, some, value, along, always))) for some in blocks])
 
-        # Some at a time: of a long record all of them take more memory than all else.
-        blocks = np.split(frequencies, range(AT_ONCE, len(frequencies), AT_ONCE))
-        means = [np.concatenate([means_of(n, some) for some in blocks]) for n in amplitudes]
+        means = [means_of(n)[: len(frequencies)] for n in amplitudes]
     # Each record has amplitudes of its own.
     own = parts.of_record == np.arange(len(bench.records))[:, None]
     return np.stack([mean * inside for mean in means for inside in own], axis=1)
+
+
+@functools.lru_cache(maxsize=64)
+def _every(apply: Callable) -> Callable:
+    """Return what an effect adds to a signal at each frequency, `[frequency, record, time]`; compiled once for it."""
+
+    def added(own, frequency, value, along, always):
+        return apply({**own, "frequency": frequency}, value, along | always) - value
+
+    at_every_time = jax.vmap(jax.vmap(added, (None, None, 0, 0, None)), (None, None, 0, 0, None))
+    return kernels.jit(jax.vmap(at_every_time, (None, 0, None, None, None)))
 
 
 def _periodogram(bench: Workbench, current: Refits, record: int, lowest: float, highest: float):
