@@ -144,7 +144,7 @@ def test_a_diagnosis_shows_its_bar_as_it_is_told(watched, progress, capsys, monk
         say("searching", 0.5)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(recipe, "select", stop)
+    monkeypatch.setattr(recipe, "forward", stop)
     with pytest.raises(KeyboardInterrupt):
         diagnose(watched.fit, watched.record, key=KEY, progress=progress)
     assert ("diagnose: searching" in capsys.readouterr().err) == progress

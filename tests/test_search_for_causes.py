@@ -42,7 +42,8 @@ def searched(monkeypatch, unchecked):
             monkeypatch.setattr(search, name, stub)
         samples = SimpleNamespace(measured=None)
         bench = SimpleNamespace(nominal=None, problem=SimpleNamespace(noise_variance=None, samples=samples))
-        return set(search.select(bench, lambda stage, done: None).included), looked
+        looks = search.forward(bench, lambda stage, done: None)
+        return set(search.select(bench, looks).included), looked
 
     return search_with
 
@@ -85,7 +86,7 @@ def test_a_search_that_goes_round_ends(searched):
 def test_rivals_of_which_each_is_better_under_the_noise_of_the_other_are_looked_at_once(monkeypatch, unchecked):
     """Where nothing explains the records many are as bad, and to look at each again takes most of a diagnosis."""
     looked = []
-    bench = SimpleNamespace()
+    bench = SimpleNamespace(problem=SimpleNamespace(substeps=1))
 
     class Looked(NamedTuple):
         trials: object
@@ -93,7 +94,7 @@ def test_rivals_of_which_each_is_better_under_the_noise_of_the_other_are_looked_
         current: object
         noise: object
 
-    def look(trials, included, current, noise):
+    def look(trials, included, current, noise, substeps):
         looked.append(included)
         return Looked(trials, included, current, noise)
 
