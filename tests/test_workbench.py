@@ -335,7 +335,7 @@ def test_a_start_that_ran_to_where_a_limit_hides_it_is_left_for_the_nominal_one(
     noise = plain_noise(of_valve.problem.noise_variance, of_valve.problem.samples.measured)
     trials = trials_of(of_valve, lambda *_: None)
     point = of_valve.nominal.copy()
-    point[[of_valve.column[f"{name}[0]"] for name in ("initial_filtered", "initial_filtered_rate")]] = 1.0
+    point[[of_valve.column[f"{name}[0]"] for name in ("initial_filtered", "initial_filtered_rate")]] = 0.0
     there = refit_set(trials, point, (), noise)
     assert there.cost[0] > 1.1 * SAMPLES
     stage = Stage(trials, (), there, noise, Screening((), (), 0.0))

@@ -11,16 +11,11 @@ from ehsvjax.diagnosis.bench.noise import Noise, noise_outside
 from ehsvjax.diagnosis.bench.workbench import ABREAST, TOLD_APART, Workbench
 
 _ITERATIONS = 60
-# A start is given up if so many steps like the next would not bring it to the best, behind so many good ones in a row:
-# a kink makes some of them short, until damping has grown and shrunk again.
+# A start is given up if so many steps like the next would not bring it to the best, so many times in a row: a kink
+# makes some of them short, until damping has grown and shrunk again.
 _HOPELESS = 5.0
-_PATIENCE = 2
+_PATIENCE = 4
 _STEEPEST = 1e100
-# Damping at first, by which it falls after a good step, and is raised until a bad one is halved; and where no step is
-# left.
-_UNDAMPED, _EASED, _DAMPED, _MOST_DAMPED = 1e-4, 0.1, 4.0, 1e12
-# Share of the residuals' variance that a step must gain.
-_LEAST_GAIN = 0.01
 # How many times as long the steps are at which a refit begins where that many times as many are not few.
 _COARSER = 8
 # Share of a step at which its curvature is taken, and of the step that its acceleration may be.
@@ -116,11 +111,9 @@ def refit(
 ) -> Refits:
     """Refit the chosen unknowns of every start.
 
-    Damping is relative to the diagonal. After a step that did not lower the cost it grows until the next is at most
-    half as long: after good steps it is so small that factors of it would change nothing. Where nothing is left to gain
-    so, the point is at a kink: the mean of the derivatives on both sides leads along it. An unknown at a bound that the
-    gradient pushes outwards is held there. Steps bend with the valley that they follow (geodesic acceleration,
-    Transtrum & Sethna 2012, arXiv 1201.5885), which takes one more simulation.
+    Damping is relative to the diagonal and grows by 2, 4, 8, ... for steps in a row that did not lower the cost
+    (Nielsen 1999); an unknown at a bound that the gradient pushes outwards is held there. Steps bend with the valley
+    that they follow (geodesic acceleration, Transtrum & Sethna 2012, arXiv 1201.5885), which takes one more simulation.
 
     Args:
         bench: the trials' workbench.
@@ -138,10 +131,9 @@ def refit(
     count, width = chosen.shape
     points = starts.copy()
     kept: list[_Here | None] = [None] * count
-    across: list[_Here | None] = [None] * count
     # Of all starts at once: of a long record by far the most that there is to remember.
     every_slope = np.zeros((count, width, *readings.shape))
-    damping, longest = np.full(count, _UNDAMPED), np.full(count, np.inf)
+    damping, growth = np.full(count, 1e-4), np.full(count, 2.0)
     cost = np.full(count, np.inf)
     converged, hopeless = np.zeros(count, bool), np.zeros(count, int)
     running, bending = np.ones(count, bool), np.ones(count, bool)
@@ -162,26 +154,21 @@ def refit(
                 points[i], cost[i] = trial[i], value
                 every_slope[i, chosen[i] >= 0] = slopes[chosen[i] >= 0]
                 kept[i] = _Here(residual, every_slope[i], jacobian @ scaled, jacobian @ jacobian.T)
-                damping[i], longest[i], across[i] = _EASED * damping[i], np.inf, None
-            here = across[i] or kept[i]
+                damping[i], growth[i] = 0.1 * damping[i], 2.0
+            else:
+                damping[i], growth[i] = damping[i] * growth[i], 2.0 * growth[i]
+            here = kept[i]
             if here is None:
                 running[i] = False
                 continue
-            failed = longest[i] < np.inf
-            bounded = points[i], chosen[i], lower, upper
-            step, gain, damping[i], length = _shortened(here, *bounded, damping[i], longest[i])
+            step, gain = _step(points[i], chosen[i], here.gradient, here.information, damping[i], lower, upper)
             variance = max(cost[i] / len(scaled), 1e-300)
-            if failed and gain < _LEAST_GAIN * variance and across[i] is None and np.isfinite(jacobian @ scaled).all():
-                across[i] = here = _across(noise, here, jacobian)
-                step, gain, damping[i], length = _shortened(here, *bounded, _UNDAMPED, np.inf)
-            longest[i] = 0.5 * length
             bending[i] = gain > variance
-            if gain < _LEAST_GAIN * variance:
+            if gain < 0.01 * variance:
                 converged[i] = True
                 running[i] = False
-            if not failed:
-                hopeless[i] = hopeless[i] + 1 if _HOPELESS * gain < cost[i] - np.min(cost) else 0
-            if damping[i] > _MOST_DAMPED or (race and hopeless[i] >= _PATIENCE):
+            hopeless[i] = hopeless[i] + 1 if _HOPELESS * gain < cost[i] - np.min(cost) else 0
+            if damping[i] > 1e12 or (race and hopeless[i] >= _PATIENCE):
                 running[i] = False
             trial[i] = points[i] + step
         # Near the minimum no valley is left to follow.
@@ -248,23 +235,6 @@ def _bend(bench, noise, trial, running, points, chosen, kept, damping, lower, up
         if 2.0 * np.linalg.norm(size * bent[own]) <= _MOST_BENT * np.linalg.norm(size * along):
             moved = trial[i, own] + 0.5 * np.where(chosen[i] >= 0, bent[own], 0.0)
             trial[i, own] = np.clip(moved, lower[own], upper[own])
-
-
-def _across(noise: Weighing, here: _Here, jacobian) -> _Here:
-    """Return what is known at a point, with the mean of its derivatives and those beyond a kink beside it."""
-    mean = 0.5 * (noise.scaled(here.slopes) + jacobian)
-    return here._replace(gradient=mean @ noise.scaled(here.residual), information=mean @ mean.T)
-
-
-def _shortened(here: _Here, point, chosen, lower, upper, damping: float, longest: float):
-    """Return a step, what it should gain, its damping, raised until it is no longer than that, and its length."""
-    size = np.sqrt(np.diag(here.information))
-    while True:
-        step, gain = _step(point, chosen, here.gradient, here.information, damping, lower, upper)
-        length = float(np.linalg.norm(size * step[np.maximum(chosen, 0)]))
-        if length <= longest or damping > _MOST_DAMPED:
-            return step, gain, damping, length
-        damping *= _DAMPED
 
 
 def _step(point, chosen, gradient, information, damping, lower, upper):

@@ -218,7 +218,7 @@ def _grown(
             of.append(k)
     if not starts:
         return [[] for _ in some]
-    led = refit(bench, np.stack(starts), padded(columns, max(map(len, columns))), noise, race=True).points
+    led = refit(bench, np.stack(starts), padded(columns, max(map(len, columns))), noise, race=False).points
     return [[point for point, i in zip(led, of, strict=True) if i == k] for k in range(len(some))]
 
 
