@@ -26,6 +26,18 @@ def shaken(until):
     return ehsvjax.Record(time, {"push": push}, {"position": position})
 
 
+def diagnosed(hidden, key=KEY):
+    """Return the fit of a record of the independent plants, and its diagnosis."""
+    (made,) = records([hidden])
+    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
+    model, population, generations = {
+        "servovalve": (ehsvjax.servovalve(), 50, 20),
+        "van_der_pol": (ehsvjax.van_der_pol(), 100, 50),
+    }[hidden.model]
+    fit = ehsvjax.identify(model, record, key=key, population=population, generations=generations)
+    return fit, ehsvjax.diagnose(fit, record, key=key)
+
+
 @pytest.mark.parametrize(("until", "named"), [(1.1, True), (0.65, False)])
 def test_a_periodic_force_is_named_only_if_it_goes_on(until, named):
     record = shaken(until)
@@ -122,20 +134,14 @@ def test_a_cause_that_is_not_there_any_more_is_contradicted():
 
 def test_a_delay_that_is_known_too_little_to_predict_by_is_in_the_answer():
     """A swinging oscillator: what its delay leaves open of the phase grows until the end of the record."""
-    (made,) = records([Hidden("van_der_pol", "white", 0.01, ("transport_delay",), 1872047817)])
-    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
-    fit = ehsvjax.identify(ehsvjax.van_der_pol(), record, key=KEY, population=100, generations=50)
-    found = ehsvjax.diagnose(fit, record, key=KEY)
+    _, found = diagnosed(Hidden("van_der_pol", "white", 0.01, ("transport_delay",), 1872047817))
     assert "transport_delay" in found.suspected, str(found)
 
 
 @pytest.mark.thorough
 def test_what_the_search_takes_for_significant_earns_its_place():
     """A bias of 4.3 standard deviations, p = 0.0011 of the whole search, was "unexplained"."""
-    (made,) = records([Hidden("servovalve", "white", 1e-5, ("asymmetric_dead_zone",), 75656314)])
-    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
-    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=KEY, population=50, generations=20)
-    found = ehsvjax.diagnose(fit, record, key=KEY)
+    _, found = diagnosed(Hidden("servovalve", "white", 1e-5, ("asymmetric_dead_zone",), 75656314))
     assert found.verdict != "unexplained", str(found)
     assert "asymmetric_dead_zone" in found.suspected
 
@@ -144,11 +150,7 @@ def test_what_the_search_takes_for_significant_earns_its_place():
 def test_a_straight_line_is_no_better_reason_than_two_effects_that_make_it():
     """A bias and a compliance: one straight line along the load pressure, of 2.00002 pieces, was said to be better."""
     pair = ("asymmetric_dead_zone", "structural_flexibility")
-    (made,) = records([Hidden("servovalve", "white", 1e-7, pair, 375512833)])
-    record = ehsvjax.Record(made.time, {"command": made.command}, {"position": made.position})
-    key = jax.random.key(375512833)
-    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=key, population=50, generations=20)
-    found = ehsvjax.diagnose(fit, record, key=key)
+    _, found = diagnosed(Hidden("servovalve", "white", 1e-7, pair, 375512833), jax.random.key(375512833))
     assert set(pair) <= found.suspected, str(found)
 
 
@@ -175,10 +177,7 @@ def test_causes_predict_worse_where_some_output_is_worse_and_none_is_surely_bett
 @pytest.mark.thorough
 def test_a_cause_that_gains_nothing_beside_what_is_missing_is_not_named():
     """A notch of the orifice, which no effect of the bank has: a sensor's bias, and seven others, stood beside it."""
-    (hidden,) = records([Hidden("servovalve", "white", 1e-8, ("unknown_spool_notch",), 656672596)])
-    record = ehsvjax.Record(hidden.time, {"command": hidden.command}, {"position": hidden.position})
-    fit = ehsvjax.identify(ehsvjax.servovalve(), record, key=KEY, population=50, generations=20)
-    found = ehsvjax.diagnose(fit, record, key=KEY)
+    fit, found = diagnosed(Hidden("servovalve", "white", 1e-8, ("unknown_spool_notch",), 656672596))
     assert (found.verdict, found.suspected) == ("unexplained", set()), str(found)
     assert (found.missing.place, found.missing.quantity) == ("opening", "opening")
     # Nor does the extended model have it.
