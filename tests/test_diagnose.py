@@ -292,6 +292,14 @@ def test_causes_that_cannot_be_told_apart_are_told_as_such(diagnosis):
     assert title.endswith(": ambiguous: sensor lag; and sensor bias or input bias")
 
 
+def test_a_parameter_that_runs_to_its_bound_beside_the_causes_is_told(diagnosis):
+    name = diagnosis.fit.model.free[0]
+    at_bound = diagnosis.extended.parameters | {name: diagnosis.fit.model.parameter(name).lower}
+    held = dataclasses.replace(diagnosis, extended=dataclasses.replace(diagnosis.extended, parameters=at_bound))
+    said = f"{name} is at its lower bound beside the causes, which may stand for what is beyond it: widen"
+    assert said in str(held) and said not in str(diagnosis)
+
+
 @pytest.mark.parametrize(
     ("innocent", "why"),
     [(True, "a single term explains the record better than several effects of the bank together"),

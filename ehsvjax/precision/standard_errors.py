@@ -24,6 +24,7 @@ from ehsvjax.precision.directions import (
 from ehsvjax.precision.remedies import unfixed_directions
 from ehsvjax.precision.residual_noise import SUSPICION, ResidualNoise, absorbed_by_the_fit, meat, residual_noise
 from ehsvjax.precision.sensitivities import ROUNDING, Sensitivities, check_finite, sensitivities
+from ehsvjax.quantities import quantity
 
 if TYPE_CHECKING:
     import matplotlib.figure
@@ -280,7 +281,7 @@ def _worth(noise: ResidualNoise, period: float, samples: int) -> str:
         return f"which all {samples} samples together do not average out"
     if together < 1.0:
         return f"whose swings cancel: of a constant one sample tells as much as {1.0 / together:.3g} with white noise"
-    return f"{together:.3g} samples ({1e3 * period * together:.3g} ms) tell as much as one"
+    return f"{together:.3g} samples ({quantity(period * together, 's')}) tell as much as one"
 
 
 def precision_of(model: Model, problem: Problem, fit: Linearised) -> Precision:

@@ -25,6 +25,8 @@ _NEGLIGIBLE = 1e-3
 # Rounds of an estimate of coloured noise at most, the share by which the last one changes it, and the share of the
 # change before that each may have.
 _ROUNDS, _SETTLED, _SETTLING = 100, 1e-3, 0.95
+# Samples of which all responses are made unit vectors at a time.
+_AT_ONCE = 16384
 # Standard errors of the correlation of neighbouring parts that chance seldom exceeds (one-sided, 10%).
 _LASTS = 1.28
 
@@ -259,7 +261,7 @@ def noise_outside(
     for k, i in channels:
         deviation[k, i] = _deviation(residual[k, :, i][measured[k, :, i]])
     standardised = np.where(measured, residual, 0.0) / deviation[:, None]
-    basis = _basis(np.concatenate(responses), measured, deviation)
+    basis = _basis(responses, measured, deviation)
     left = standardised - _combined(basis, np.tensordot(standardised.swapaxes(1, 2), basis, 3))
     # Directions that were taken of each output, a share of one where it is in several.
     taken = {(k, i): float(np.vdot(basis[k, i], basis[k, i])) for k, i in channels}
@@ -343,20 +345,35 @@ def _alike(noise: ResidualNoise, before: ResidualNoise) -> bool:
 def _basis(responses, measured, deviation) -> Float[np.ndarray, "record signal time direction"]:
     """Return orthonormal directions of the responses' space, the strongest; at most half as many as samples.
 
-    Of a long record the responses take much memory: they are standardised and made into unit vectors where they are.
+    Of a long record all responses as unit vectors would take more memory than all else: they are made piece by piece.
     """
-    shape = responses.shape[1:]
-    responses[:, ~measured] = 0.0
-    responses /= deviation[:, None]
-    flat = responses.reshape(len(responses), -1)
-    norms = np.sqrt(np.einsum("ij,ij->i", flat, flat))
-    flat /= np.where(norms > 0, norms, 1.0)[:, None]
+    time = measured.shape[1]
+    pieces = [slice(first, first + _AT_ONCE) for first in range(0, time, _AT_ONCE)]
+
+    def standardised(piece: slice) -> Float[np.ndarray, "response sample"]:
+        block = np.concatenate([some[:, :, piece] for some in responses], dtype=float)
+        block[:, ~measured[:, piece]] = 0.0
+        block /= deviation[:, None]
+        return block.reshape(len(block), -1)
+
+    norms = np.sqrt(sum(np.einsum("ij,ij->i", block, block) for block in map(standardised, pieces)))
+
+    def unit(piece: slice) -> Float[np.ndarray, "response sample"]:
+        block = standardised(piece)
+        block /= np.where(norms > 0, norms, 1.0)[:, None]
+        return block
+
     # There are many more samples than responses: their products are quicker decomposed.
-    squares, combinations = np.linalg.eigh(flat @ flat.T)
-    order = np.argsort(-squares)[: flat.shape[1] // 2]
+    squares, combinations = np.linalg.eigh(sum(block @ block.T for block in map(unit, pieces)))
+    order = np.argsort(-squares)[: measured.size // 2]
     kept = order[squares[order] > _NEGLIGIBLE**2 * np.max(squares, initial=0.0)]
-    vectors = flat.T @ (combinations[:, kept] / np.sqrt(squares[kept]))
-    return np.ascontiguousarray(vectors.reshape(*shape, -1).swapaxes(1, 2))
+    root = combinations[:, kept] / np.sqrt(squares[kept])
+    records, signals = _channels(measured)
+    basis = np.empty((records, signals, time, len(kept)))
+    for piece in pieces:
+        vectors = unit(piece).T @ root
+        basis[:, :, piece] = vectors.reshape(records, -1, signals, len(kept)).swapaxes(1, 2)
+    return basis
 
 
 def _deviation(values) -> float:

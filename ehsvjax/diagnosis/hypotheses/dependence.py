@@ -120,9 +120,10 @@ def _examined(final: Refits, noise: Noise, terms: Terms) -> tuple[list[_Test], F
     rows = np.split(terms.responses, np.cumsum([len(c.values) for c in terms.curves])[:-1])
     tests = []
     for curve, responses in zip(terms.curves, rows, strict=True):
-        part = noise.innovations(responses)
-        outside = part - (part @ known) @ known.T
-        basis = _basis(outside, np.linalg.norm(part, axis=1))
+        outside = noise.innovations(responses)
+        norms = np.linalg.norm(outside, axis=1)
+        outside -= (outside @ known) @ known.T
+        basis = _basis(outside, norms)
         if basis.shape[1]:
             tests.append(_Test(curve, basis, _waves(curve, outside @ basis)))
     return tests, r

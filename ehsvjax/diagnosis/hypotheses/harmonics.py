@@ -146,7 +146,7 @@ def _range_of(bench: Workbench, candidate: Candidate) -> tuple[float, float]:
 def _explained(waves: Waves, noise: Noise, known, r) -> Float[np.ndarray, " frequency"]:
     """Return the noise variances of the residual that an effect would take at each frequency, to first order."""
     changes = noise.innovations(waves.parts.responses)
-    changes = changes - (changes @ known) @ known.T
+    changes -= (changes @ known) @ known.T
     along = waves.shares @ (changes @ r)
     information = np.einsum("fap,pq,fbq->fab", waves.shares, changes @ changes.T, waves.shares, optimize=True)
     # An amplitude that does not show takes nothing.

@@ -10,7 +10,7 @@ from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN
 from ehsvjax.diagnosis.hypotheses.curves import quantity_unit
 from ehsvjax.diagnosis.results.causes import Cause, Size, how_sure
 from ehsvjax.diagnosis.results.with_term import terms_that_act
-from ehsvjax.fit import EXPLAINS_NOTHING, at_bounds
+from ehsvjax.fit import EXPLAINS_NOTHING, at_bound, at_bounds
 from ehsvjax.models.model import Parameter
 from ehsvjax.quantities import quantity
 
@@ -186,6 +186,7 @@ def misfit_lines(diagnosis: "Diagnosis") -> list[str]:
 def cause_lines(diagnosis: "Diagnosis") -> list[str]:
     """Return the causes with their sizes, or the missing term."""
     lines = [_cause_line(diagnosis, cause) for cause in diagnosis.causes]
+    lines += _held_beside(diagnosis)
     if diagnosis.verdict == "unexplained":
         lines += _not_sure(diagnosis)
     m = diagnosis.missing
@@ -204,6 +205,14 @@ def cause_lines(diagnosis: "Diagnosis") -> list[str]:
             others = " or ".join(map(str, m.alike))
             lines.append(f"{others} would explain as much")
     return lines
+
+
+def _held_beside(diagnosis: "Diagnosis") -> list[str]:
+    """Return which parameters run to a bound beside the causes, which may then stand for what is beyond it."""
+    free = {*diagnosis.fit.model.free} - {*diagnosis.names} if diagnosis.causes else ()
+    held = at_bounds(diagnosis.extended.model, diagnosis.extended.parameters)
+    beside = " beside the causes, which may stand for what is beyond it"
+    return [at_bound(name, side, beside) for name, side in held if name in free]
 
 
 def _not_sure(diagnosis: "Diagnosis") -> list[str]:
