@@ -108,6 +108,7 @@ SIZES: dict[str, dict[str, float]] = {
     "sensor_bias": {"bias": 1e-3},
     "sensor_asymmetry": {"error": 0.03},
     "sensor_drift": {"drift": 1e-3},
+    "sensor_hum": {"cosine": 0.0, "sine": 5e-4, "frequency": 60.0},
     "sensor_cubic": {"coefficient": 10.0},
     "sensor_saturation": {"limit": 0.03},
     "sensor_lag": {"time_constant": 3e-3},

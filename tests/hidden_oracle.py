@@ -41,7 +41,7 @@ _OF_FIRST_ORDER = 0.03
 # Rivals that are refitted in the place of what is hidden.
 _RIVALS_REFITTED, _HARMONIC_REFITTED = 3, 2
 # Rivals of the oscillator's with a frequency, rad/s, any of which may be the one that is like something else; phases.
-_HARMONIC, _HIGHEST_FREQUENCY, _PHASES = ("harmonic_force", "parametric_excitation"), 6.0, 8
+_HARMONIC, _HIGHEST_FREQUENCY, _PHASES = ("harmonic_force", "parametric_excitation", "sensor_hum"), 6.0, 8
 # Of the oscillator where it is refitted, s: a step a sample, whose error is a millionth.
 _REFIT_STEP = 0.02
 _INITIAL_CONDITIONS = {"servovalve": 1, "van_der_pol": 2}
@@ -255,7 +255,7 @@ def variants_of(model: str, duration: float) -> dict[str, list[dict[str, float]]
         if name in found:
             found[name].append(sizes)
     half_wave = np.pi / duration
-    for name in set(_HARMONIC) & set(found):
+    for name in _HARMONIC if model == "van_der_pol" else ():
         found[name] = [
             {**found[name][0], "frequency": frequency, "phase": phase}
             for frequency in np.arange(half_wave, _HIGHEST_FREQUENCY, half_wave)

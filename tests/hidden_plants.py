@@ -41,6 +41,7 @@ SERVOVALVE_EFFECTS = {
     "sensor_asymmetry": {"error": (0.0, 2e-3, 2e-2)},
     "sensor_bias": {"bias": (0.0, 1e-4, 1e-3)},
     "sensor_drift": {"drift": (0.0, 2e-4, 2e-3)},
+    "sensor_hum": {"amplitude": (0.0, 5e-5, 1e-3), "frequency": (0.0, 20.0, 1500.0), "phase": ANY_PHASE},
     "sensor_saturation": {"limit": (np.inf, 0.03, 0.05)},
     "sensor_quantisation": {"step": (0.0, 2e-5, 5e-4)},
     "hardening_spring": {"coefficient": (0.0, 5.6e5, 2.8e6)},
@@ -82,6 +83,7 @@ VAN_DER_POL_EFFECTS = {
     "harmonic_force": {"force": (0.0, 0.02, 0.1), "frequency": (0.0, 0.3, 5.0), "phase": ANY_PHASE},
     "parametric_excitation": {"depth": (0.0, 0.02, 0.1), "frequency": (0.0, 0.3, 5.0), "phase": ANY_PHASE},
     "sensor_bias": {"bias": (0.0, 0.02, 0.2)},
+    "sensor_hum": {"amplitude": (0.0, 0.02, 0.2), "frequency": (0.0, 0.3, 60.0), "phase": ANY_PHASE},
     "sensor_gain": {"error": (0.0, 0.01, 0.1)},
     "sensor_asymmetry": {"error": (0.0, 0.01, 0.1)},
     "sensor_cubic": {"coefficient": (0.0, 5e-3, 0.05)},
@@ -159,7 +161,7 @@ def servovalve_with(
     sizes = [_sizes_of(some, SERVOVALVE_EFFECTS, ValveSizes) for some in effects]
     command = _checked_command(command, len(effects))
     batch, samples = command.shape
-    fraction, noise = np.arange(samples) / samples, np.broadcast_to(noise, command.shape)
+    clock, noise = np.arange(samples) * sample_period, np.broadcast_to(noise, command.shape)
     given = np.broadcast_arrays(np.zeros(batch), *Valve(**valve), initial_position)[1:]
     position, displacement, pressure = np.empty((3, batch, samples))
     for i, size in enumerate(sizes):
@@ -168,7 +170,8 @@ def servovalve_with(
         timing = _timing(size.transport_delay_delay, sample_period, fine_step)
         matrix = _filter_matrix(one.natural_frequency, one.damping_ratio, timing[1])
         position[i], displacement[i], pressure[i] = _valve_and_load(command[i], timing, matrix, one, size, initial)
-        position[i] = _sensed_position(position[i], size.sensor_bias_bias + size.sensor_drift_drift * fraction, size)
+        drifted = size.sensor_drift_drift * clock / (samples * sample_period)
+        position[i] = _sensed_position(position[i], size.sensor_bias_bias + drifted + _hum(clock, size), size)
         position[i] += noise[i]
         if size.sensor_quantisation_step > 0.0:
             position[i] = size.sensor_quantisation_step * np.round(position[i] / size.sensor_quantisation_step)
@@ -207,7 +210,8 @@ def van_der_pol_with(
         start = (starts[i, 0], starts[i, 1])
         position[i], velocity[i] = _oscillation(shaped, timing, oscillator, size, start, kicks)
         bent = position[i] + size.sensor_cubic_coefficient * position[i] ** 3
-        position[i] = _sensed_position(bent, size.sensor_bias_bias, size)
+        hum = _hum(np.arange(samples) * sample_period, size)
+        position[i] = _sensed_position(bent, size.sensor_bias_bias + hum, size)
     return {"position": position, "velocity": velocity}
 
 
@@ -516,6 +520,11 @@ def _sensed_position(position, bias, sizes):
     position = np.where(position < 0.0, (1.0 + sizes.sensor_asymmetry_error) * position, position)
     position = (1.0 + sizes.sensor_gain_error) * position + bias
     return np.clip(position, -sizes.sensor_saturation_limit, sizes.sensor_saturation_limit)
+
+
+def _hum(clock, sizes):
+    """What the mains add to a sensor, at times [time]."""
+    return sizes.sensor_hum_amplitude * np.sin(sizes.sensor_hum_frequency * clock + sizes.sensor_hum_phase)
 
 
 def _shaped_input(command, sizes):

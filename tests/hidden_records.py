@@ -27,7 +27,7 @@ ONE_SIDED = frozenset(
     oil_compressibility structural_flexibility spool_rate_limit torque_motor_hysteresis feedback_backlash
     transport_delay sensor_lag sensor_saturation sensor_quantisation end_stop flow_gain_rounding harmonic_load
     damping_threshold input_lag input_dead_zone input_saturation harmonic_force parametric_excitation process_noise
-    unknown_position_dependent_supply unknown_spool_notch unknown_cogging elastic_friction area_ratio
+    unknown_position_dependent_supply unknown_spool_notch unknown_cogging elastic_friction area_ratio sensor_hum
     """.split()  # noqa: SIM905
 )
 

@@ -60,9 +60,11 @@ STOP = {"position": 0.01, "stiffness": 8e7}
 def in_the_package(name, sizes):
     """Return the numbers of the package's effect that has a plant's sizes."""
     if "phase" in sizes:
-        # A load by the sine of the plant's phase, against the package's force; the oscillator's by its cosine.
-        size, phase = sizes.get("force", sizes.get("depth")), sizes["phase"]
-        turned = (-np.sin(phase), -np.cos(phase)) if name == "harmonic_load" else (np.cos(phase), -np.sin(phase))
+        # A load by the sine of the plant's phase, against the package's force, a hum with it; the rest by its cosine.
+        (size,), phase = sizes.keys() - {"frequency", "phase"}, sizes["phase"]
+        size, sine = sizes[size], np.array([np.sin(phase), np.cos(phase)])
+        by_name = {"harmonic_load": -sine, "sensor_hum": sine}
+        turned = by_name.get(name, (np.cos(phase), -np.sin(phase)))
         return {"cosine": size * turned[0], "sine": size * turned[1], "frequency": sizes["frequency"]}
     found = {}
     for number, value in sizes.items():

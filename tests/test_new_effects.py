@@ -194,6 +194,33 @@ def test_a_sensor_that_shows_one_side_otherwise_or_without_its_sign_is_named(gai
     assert found.extended.parameters["sensor_asymmetry.error"] == pytest.approx(gain - 1.0, rel=0.05)
 
 
+@pytest.mark.parametrize(
+    ("frequency", "suspected"),
+    [(20.0, {"sensor_hum", "harmonic_force"}),
+     # Beyond what held forces are looked for at: half the sample rate is 157 rad/s.
+     (140.0, {"sensor_hum"})],
+)  # fmt: skip
+def test_a_hum_of_the_sensor_is_not_taken_for_a_force(frequency, suspected):
+    """In a linear plant a force of that frequency moves the position alike: no record of it alone tells which."""
+    push = held_levels(9, 20.0, SAMPLES // 20, 20)
+    time = PERIOD * np.arange(SAMPLES)
+    position = carriage_plant(push, PERIOD)[:, 0] + 2e-3 * np.sin(frequency * time + 1.0)
+    found = diagnosed(carriage(), record_of(PERIOD, {"push": push}, {"position": position}, NOISE, 10))
+    assert found.suspected == suspected, str(found)
+    assert found.causes[0].probability > 0.95 or len(suspected) > 1
+
+
+def test_a_hum_is_found_at_the_sensor_that_has_it():
+    push = held_levels(11, 20.0, SAMPLES // 20, 20)
+    both = carriage_plant(push, PERIOD)
+    hum = 0.02 * np.cos(25.0 * PERIOD * np.arange(SAMPLES))
+    outputs = {"position": both[:, 0], "velocity": both[:, 1] + hum}
+    found = diagnosed(carriage(), record_of(PERIOD, {"push": push}, outputs, NOISE | {"velocity": 5e-3}, 12))
+    assert (found.verdict, found.names) == ("named", ("sensor_hum@velocity",)), str(found)
+    sizes = {size.number: size.value for size in found.causes[0].sizes}
+    assert sizes["cosine"] == pytest.approx(0.02, rel=0.1) and sizes["frequency"] == pytest.approx(25.0, rel=1e-3)
+
+
 def test_every_input_may_reach_every_sensor_that_is_measured():
     found = {c.name for c in attached_candidates(carriage(), ("position", "velocity"))}
     assert {"feedthrough_of_push@position", "feedthrough_of_push@velocity"} <= found

@@ -26,16 +26,6 @@ def _per(quantity: str, power: int):
     return lambda scales: _probe(scales) / max(scales[quantity], 1e-300) ** power
 
 
-_FREQUENCY = shape(
-    "frequency",
-    "rad/s",
-    lambda scales: scales["frequencies"],
-    # What a record has not shown twice is not known to be periodic: it would stand for anything that is slow.
-    lambda scales: 4.0 * math.pi / scales["duration"],
-    lambda scales: 2.0 / scales["sample_period"],
-)
-
-
 def _sign(velocity):
     """Sign of a velocity; zero at rest."""
     return velocity / jnp.maximum(jnp.abs(velocity), 1e-12)
@@ -71,9 +61,20 @@ def harmonic(own, context):
     return -(own["cosine"] * jnp.cos(angle) + own["sine"] * jnp.sin(angle))
 
 
-def harmonic_parameters(unit, probe):
-    """Return the numbers of a harmonic: its two amplitudes, and a frequency that is looked for in the record."""
-    return amplitude("cosine", unit, probe), amplitude("sine", unit, probe), _FREQUENCY
+def harmonic_parameters(unit, probe, turn=2.0):
+    """Return the numbers of a harmonic: its two amplitudes, and a frequency that is looked for in the record.
+
+    Up to that of a turn of so many radians in a sample period, of which pi is the highest that readings show.
+    """
+    frequency = shape(
+        "frequency",
+        "rad/s",
+        lambda scales: scales["frequencies"],
+        # What a record has not shown twice is not known to be periodic: it would stand for anything that is slow.
+        lambda scales: 4.0 * math.pi / scales["duration"],
+        lambda scales: turn / scales["sample_period"],
+    )
+    return amplitude("cosine", unit, probe), amplitude("sine", unit, probe), frequency
 
 
 def _stribeck_shape(scales: Scales):

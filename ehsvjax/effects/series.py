@@ -1,10 +1,13 @@
 """Effects on an input, as a whole before it is simulated, and on a sensor."""
 
+import math
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
 from ehsvjax.effects.effect import Effect, Scales, amplitude, constant, limit, off_by_error, relative_error, size, width
+from ehsvjax.effects.forces import harmonic, harmonic_parameters
 from ehsvjax.holds import at_nodes, following
 from ehsvjax.holds import course as course_of
 
@@ -277,6 +280,15 @@ SENSOR = (
         needs=("time",),
         says="the sensor's zero moves as time passes",
         settled_by="the same level at the beginning and at the end, by a gauge",
+    ),
+    Effect(
+        "sensor_hum",
+        "sensor",
+        harmonic_parameters("{value}", _small, turn=math.pi),
+        lambda own, y, context: y - harmonic(own, context),
+        needs=("time",),
+        says="a harmonic is added to what the sensor shows, as by the mains",
+        settled_by="read the sensor while the machine stands still",
     ),
     Effect(
         "sensor_cubic",

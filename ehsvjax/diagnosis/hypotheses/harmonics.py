@@ -79,9 +79,11 @@ def with_frequencies(bench: Workbench, current: Refits, noise: Noise, waves: Map
             there = waves[candidate.name]
             peaks += _peaks(there.frequencies, _explained(there, noise, known, r))
             lowest = there.edge
-        # A record that does not hold the first output says nothing of it.
-        for k in np.flatnonzero(bench.problem.samples.measured[..., 0].any(axis=1)).tolist():
-            peaks += _peaks(*_periodogram(bench, current, k, lowest, highest))
+        # What is added to a reading shows there, whatever else in the first; where a record holds it.
+        names = bench.problem.observed
+        output = names.index(candidate.signal) if candidate.signal in names else 0
+        for k in np.flatnonzero(bench.problem.samples.measured[..., output].any(axis=1)).tolist():
+            peaks += _peaks(*_periodogram(bench, current, k, output, lowest, highest))
         peaks = [(strength, frequency) for strength, frequency in peaks if not _of_inputs(frequency, of_inputs)]
         scales[candidate.name] = {**own, "frequencies": _strongest(peaks, duration) or own["frequencies"]}
     return replace(bench, scales={**bench.scales, **scales})
@@ -190,11 +192,11 @@ def _every(apply: Callable) -> Callable:
     return kernels.jit(jax.vmap(at_every_time, (None, 0, None, None, None)))
 
 
-def _periodogram(bench: Workbench, current: Refits, record: int, lowest: float, highest: float):
-    """Return frequencies between two, rad/s, and how strong a record's residual of the first output is there."""
+def _periodogram(bench: Workbench, current: Refits, record: int, output: int, lowest: float, highest: float):
+    """Return frequencies between two, rad/s, and how strong a record's residual of an output is there."""
     present = bench.present[record]
-    measured = bench.problem.samples.measured[record, present, 0]
-    residual = np.where(measured, current.residual[0, record, present, 0], 0.0)
+    measured = bench.problem.samples.measured[record, present, output]
+    residual = np.where(measured, current.residual[0, record, present, output], 0.0)
     size = 8 * len(residual)
     power = np.abs(np.fft.rfft((residual - residual.mean()) * np.hanning(len(residual)), size)) ** 2
     frequency = 2.0 * np.pi * np.fft.rfftfreq(size, float(bench.problem.samples.sample_period[record]))
