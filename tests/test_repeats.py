@@ -8,6 +8,7 @@ import ehsvjax
 from ehsvjax.diagnosis import recipe
 from ehsvjax.diagnosis.decision.prediction import Predicted
 from ehsvjax.diagnosis.decision.verdict import PROCESS_NOISE, UNKNOWN, verdict_of
+from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.explanations import explanations_of
 from ehsvjax.diagnosis.results.gain import gain_of
 from tests.small_models import carriage, carriage_plant, record_of
@@ -68,6 +69,11 @@ def test_what_leaves_something_and_predicts_nothing_may_stand_for_what_the_bank_
         assert open_group == {name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5}
     assert unsure.word == "ambiguous" and "another record" in unsure.alternatives[0].settled_by
     assert verdict_of(examined, (False,)) == verdict_of(examined, (True,))
+    # So may a force that no repeat has shown to be chance.
+    for settled in (False, True):
+        force = ProcessNoise("force", 1.0, 10.0, 0.0, settled)
+        cause, _ = verdict_of(examined._replace(chance=force), (False,)).groups
+        assert (UNKNOWN in cause) == (not settled)
     # What the bank lacks is no model that an experiment could be planned to tell from the cause.
     alone = unsure._replace(groups=({found.names[0]: 0.5, UNKNOWN: 0.5},))
     assert explanations_of(examined.selection, alone) == ()

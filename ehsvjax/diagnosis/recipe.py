@@ -15,7 +15,7 @@ from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench, with_readings
 from ehsvjax.diagnosis.decision.examination import Examination, examine
 from ehsvjax.diagnosis.decision.search import forward, select
-from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, Verdict, leaves_something, verdict_of
+from ehsvjax.diagnosis.decision.verdict import UNEXPLAINED, Verdict, may_be_unknown, verdict_of
 from ehsvjax.diagnosis.hypotheses.own_effects import check_own_effects
 from ehsvjax.diagnosis.hypotheses.process_noise import ProcessNoise
 from ehsvjax.diagnosis.results.causes import causes_of
@@ -110,7 +110,7 @@ def _diagnosed(
     wider, gain, verdict = _judged(examined, nominal, validation, rng)
     alone = () if _explained(verdict.word, examined.innocent, examined.chance) else each_alone()
     disagree = bool(alone) and not _confirmed(verdict, alone)
-    worse = gain.worse and not examined.innocent
+    worse = gain.worse and may_be_unknown(examined.innocent, examined.chance)
     if selection.included and (disagree or worse or verdict is UNEXPLAINED):
         # What explains a part and predicts worse than nothing, stands for what single records have, or has not earned
         # its place beside what is missing, is left out again, and all is judged anew.
@@ -145,8 +145,8 @@ def _diagnosed(
 
 
 def _explained(word: str, innocent: bool, chance: ProcessNoise | None) -> bool:
-    """Whether nothing is left that the bank may lack; a force that was not seen to be chance may be that."""
-    return not leaves_something(word, innocent) and (chance is None or chance.settled)
+    """Whether nothing is left that the bank may lack."""
+    return word != UNEXPLAINED.word and not may_be_unknown(innocent, chance)
 
 
 def _each_alone(

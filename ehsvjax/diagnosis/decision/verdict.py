@@ -58,6 +58,11 @@ def leaves_something(word: str, innocent: bool) -> bool:
     return word == "unexplained" or not innocent
 
 
+def may_be_unknown(innocent: bool, chance: ProcessNoise | None) -> bool:
+    """Whether what is left may be what the bank lacks: something is left, or a force that was not seen to be chance."""
+    return not innocent or (chance is not None and not chance.settled)
+
+
 def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     """Return the verdict, with the causes and what could be there instead.
 
@@ -69,8 +74,8 @@ def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     selection, bench = examined.selection, examined.selection.bench
     order = np.argsort([-need.gain for need in selection.needs]).tolist()
     groups = [_group(examined, k) for k in order]
-    if not examined.innocent:
-        # Where something is left, what predicts nothing may as well stand for what the bank lacks.
+    if may_be_unknown(examined.innocent, examined.chance):
+        # There, what predicts nothing may as well stand for what the bank lacks.
         groups = [g if predicted_by[k] else _or_unknown(g) for k, g in zip(order, groups, strict=True)]
     if examined.lacking or not (examined.innocent or groups):
         return UNEXPLAINED
