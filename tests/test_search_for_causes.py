@@ -10,7 +10,10 @@ from ehsvjax.diagnosis.decision import search
 
 def stage_of(included):
     refitted = SimpleNamespace(points=[None])
-    return SimpleNamespace(trials=SimpleNamespace(bench=None), included=included, current=refitted, noise=None)
+    trials = SimpleNamespace(bench=None)
+    return SimpleNamespace(
+        trials=trials, included=included, current=refitted, noise=None, leaves_something=False
+    )  # fmt: skip
 
 
 @pytest.fixture

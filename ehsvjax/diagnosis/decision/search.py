@@ -157,23 +157,51 @@ def select(bench: Workbench, found: Sequence[Stage]) -> Selection:
 
     """
     looked_beside = {frozenset(stage.included) for stage in found}
+    replaced: set[frozenset[int]] = set()
     *stages, last = found
     nominal = found[0].current
     weighed = _weighed(last, nominal)
     while True:
         last = weighed.stage
+        included = frozenset(last.included)
+        look: Stage | None
         if weighed.needless is not None:
             # What was added first can become needless by what was added later.
-            look: Stage | None = _look_without(last, [weighed.needless])
-        elif frozenset(last.included) not in looked_beside and len(looked_beside) <= len(stages) + _ROUNDS:
+            look = _look_without(last, [weighed.needless])
+        elif included not in looked_beside and len(looked_beside) <= len(stages) + _ROUNDS:
             # Beside what was swapped in, or without what was needless, something else may explain the rest.
-            looked_beside.add(frozenset(last.included))
+            looked_beside.add(included)
             look = _next_effect(last)
+        elif included not in replaced and len(replaced) < _ROUNDS:
+            replaced.add(included)
+            look = _two_in_the_place_of_one(weighed)
+            if look is None:
+                break
         else:
             break
         if look is not None:
             weighed = _weighed(look, nominal)
     return _selection(bench, stages, weighed)
+
+
+def _two_in_the_place_of_one(weighed: "_Weighed") -> Stage | None:
+    """Return the look with the best rival of any cause in its place and one effect more, if that explains what is left.
+
+    What acts alone like two causes together, but for a little, comes before either of them, and leaves too little for
+    a further one to gain much beside it.
+    """
+    stage, noise = weighed.stage, weighed.stage.noise
+    rivals = {k: group[1] for k, group in enumerate(weighed.rivals) if len(group) > 1}
+    if not stage.leaves_something or not rivals:
+        return None
+    place = min(rivals, key=lambda k: rivals[k].deficit)
+    instead = tuple(rivals[k].candidate if k == place else j for k, j in enumerate(stage.included))
+    found = _next_effect(_look(stage.trials, instead, rivals[place].refitted, noise))
+    if found is None:
+        return None
+    required = required_gain(stage.trials.bench, stage.screening, found.included[-1])
+    gained = found.noise.gained(stage.current.residual[0], found.current.residual[0])
+    return found if gained > required else None
 
 
 def without(selection: Selection, causes: Sequence[int]) -> Selection:
