@@ -46,3 +46,63 @@ def test_one_run_predicts_a_repeat_and_other_voltages():
     assert slope == pytest.approx(0.155, rel=0.03)
     for name, least in (("pA_3V_s02", 96.0), ("pA_2V_s01", 94.0), ("pA_4V_s01", 94.0)):
         assert fit.score(_stroke_out(name)).fit_percent["position"] > least, name
+
+
+STOPS = {
+    "end_stop.positive_end": (0.194, 0.22),
+    "end_stop.positive_stiffness": (1e6, 3e7),
+    "end_stop.negative_end": (0.0, 0.01),
+    "end_stop.negative_stiffness": (1e6, 3e7),
+}
+
+
+def _out_and_back(name):
+    """A run from stop to stop without most of the time that it waits there; nothing is measured at the upper one."""
+    record = ehsvjax.Record.from_csv(
+        FOLDER / f"{name}.csv",
+        time="t_s",
+        inputs={"command": ehsvjax.Column("valve_cmd_V", scale=1e-4)},
+        outputs={"position": ehsvjax.Column("position_raw_V", scale=0.02, offset=-0.0055)},
+    )
+    command, position = record.inputs["command"], record.outputs["position"]
+    position = np.where(position > 0.194, np.nan, position)
+
+    def mostly(so):
+        return np.convolve(so, np.ones(31), "same") > 15
+
+    arrives, leaves = np.flatnonzero(mostly(np.isnan(position)))[[0, -1]]
+    position[arrives:leaves] = np.nan
+    turned = np.flatnonzero(command < 0)[0]
+    back = leaves + np.flatnonzero(mostly(position < 0.003)[leaves:])[0]
+    kept = np.r_[: arrives + 100, turned - 150 : back + 200]
+    return ehsvjax.Record(np.arange(len(kept)) * 1e-3, {"command": command[kept]}, {"position": position[kept]})
+
+
+@pytest.mark.xfail(
+    strict=True,
+    reason="from the ratio of the areas, found first, three causes are reached that explain no more than two areas and "
+    "a backlash do: of what is swapped in for one cause it is not asked whether another is needless then",
+)
+def test_of_one_run_out_and_back_two_areas_or_a_load_are_in_the_answer_and_other_voltages_are_predicted():
+    """A rod makes the areas two; any bias, with a dead zone beside it, explains one voltage and predicts no other."""
+    piston, rod = np.pi / 4 * 0.016**2, np.pi / 4 * 0.010**2
+    model = ehsvjax.servovalve(
+        open_loop=True, piston_area=piston - rod / 2, supply_pressure=4.35e6, mass=1.0, stiffness=0.0
+    )
+    one_run = _out_and_back("pA_3V_s01")
+    stopped = ehsvjax.effects.attach(model, STOPS, duration=one_run.time[-1], bank=ehsvjax.effects.BANK)
+    hardness = {name: 1e7 for name in STOPS if name.endswith("stiffness")}
+    settings = SETTINGS | {
+        "population": 40,
+        "generations": 20,
+        "starts": 2,
+        "fixed": SETTINGS["fixed"] | hardness,
+        "initial": SETTINGS["initial"] | {"initial_position": 0.0},
+    }
+    fit = ehsvjax.identify(stopped, one_run, key=jax.random.key(0), **settings)
+    found = ehsvjax.diagnose(fit, one_run, key=jax.random.key(1))
+    groups = [set(group.causes) for group in found.alternatives] + [{name} for name in found.names]
+    (areas,) = (group for group in groups if {"area_asymmetry", "constant_load"} & group)
+    assert areas <= {"area_asymmetry", "area_ratio", "constant_load"}, str(found)
+    for name, least in (("pA_2V_s01", 94.0), ("pA_4V_s01", 95.0)):
+        assert found.extended.score(_out_and_back(name)).fit_percent["position"] > least, str(found)

@@ -31,7 +31,8 @@ from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, response
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
 _ROUNDS = 6
-# Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough.
+# Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough, and none takes the place of
+# what is ahead of it by so much.
 _WEIGHED = 25.0
 
 
@@ -185,23 +186,20 @@ def select(bench: Workbench, found: Sequence[Stage]) -> Selection:
 
 
 def _two_in_the_place_of_one(weighed: "_Weighed") -> Stage | None:
-    """Return the look with the best rival of any cause in its place and one effect more, if that explains what is left.
+    """Return the look with the nearest rival of any cause in its place and one effect more, if nothing is left then.
 
     What acts alone like two causes together, but for a little, comes before either of them, and leaves too little for
     a further one to gain much beside it.
     """
-    stage, noise = weighed.stage, weighed.stage.noise
-    rivals = {k: group[1] for k, group in enumerate(weighed.rivals) if len(group) > 1}
+    stage = weighed.stage
+    near = {k: [r for r in group[1:] if r.deficit < _WEIGHED] for k, group in enumerate(weighed.rivals)}
+    rivals = {k: some[0] for k, some in near.items() if some}
     if not stage.leaves_something or not rivals:
         return None
     place = min(rivals, key=lambda k: rivals[k].deficit)
     instead = tuple(rivals[k].candidate if k == place else j for k, j in enumerate(stage.included))
-    found = _next_effect(_look(stage.trials, instead, rivals[place].refitted, noise))
-    if found is None:
-        return None
-    required = required_gain(stage.trials.bench, stage.screening, found.included[-1])
-    gained = found.noise.gained(stage.current.residual[0], found.current.residual[0])
-    return found if gained > required else None
+    found = _next_effect(_look(stage.trials, instead, rivals[place].refitted, stage.noise))
+    return None if found is None or found.leaves_something else found
 
 
 def without(selection: Selection, causes: Sequence[int]) -> Selection:
