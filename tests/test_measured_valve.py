@@ -78,6 +78,7 @@ def _out_and_back(name):
     return ehsvjax.Record(np.arange(len(kept)) * 1e-3, {"command": command[kept]}, {"position": position[kept]})
 
 
+@pytest.mark.thorough
 @pytest.mark.xfail(
     strict=True,
     reason="from the ratio of the areas, found first, three causes are reached that explain no more than two areas and "

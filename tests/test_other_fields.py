@@ -29,6 +29,7 @@ def test_two_causes_are_found_where_one_alone_is_nearly_like_both():
     assert not found.leaves_something
 
 
+@pytest.mark.thorough
 def test_hills_of_a_road_are_no_periodic_force():
     found = diagnosed(hills(np.random.default_rng(11)), 11)
     assert answer(found, frozenset()) == "left open", str(found)
