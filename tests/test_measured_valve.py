@@ -23,22 +23,32 @@ SETTINGS = {
 }
 
 
-def _stroke_out(name):
-    """The stroke out from rest until the piston is about to meet the end of the sensor, 1 V as 0.1 mm and 20 mm."""
-    record = ehsvjax.Record.from_csv(
+def _read(name, offset=0.0):
+    """A run as measured, 1 V as 0.1 mm of the valve's stroke and 20 mm of the piston's."""
+    return ehsvjax.Record.from_csv(
         FOLDER / f"{name}.csv",
         time="t_s",
         inputs={"command": ehsvjax.Column("valve_cmd_V", scale=1e-4)},
-        outputs={"position": ehsvjax.Column("position_raw_V", scale=0.02)},
+        outputs={"position": ehsvjax.Column("position_raw_V", scale=0.02, offset=offset)},
     )
+
+
+def _valve():
+    """The valve and its cylinder, of one area: the mean of the two that its rod leaves."""
+    piston, rod = np.pi / 4 * 0.016**2, np.pi / 4 * 0.010**2
+    return ehsvjax.servovalve(
+        open_loop=True, piston_area=piston - rod / 2, supply_pressure=4.35e6, mass=1.0, stiffness=0.0
+    )
+
+
+def _stroke_out(name):
+    """The stroke out from rest until the piston is about to meet the end of the sensor."""
+    record = _read(name)
     return record.slice(0.0, record.time[np.flatnonzero(record.outputs["position"] > 0.195)[0]])
 
 
 def test_one_run_predicts_a_repeat_and_other_voltages():
-    piston, rod = np.pi / 4 * 0.016**2, np.pi / 4 * 0.010**2
-    model = ehsvjax.servovalve(
-        open_loop=True, piston_area=piston - rod / 2, supply_pressure=4.35e6, mass=1.0, stiffness=0.0
-    )
+    model = _valve()
     fit = ehsvjax.identify(model, _stroke_out("pA_3V_s01"), key=jax.random.key(0), **SETTINGS)
     assert fit.fit_percent["position"] > 97.0
     # The stroke takes 0.155 m/s at 3 V, as a straight line through the measured positions shows.
@@ -58,12 +68,7 @@ STOPS = {
 
 def _out_and_back(name):
     """A run from stop to stop without most of the time that it waits there; nothing is measured at the upper one."""
-    record = ehsvjax.Record.from_csv(
-        FOLDER / f"{name}.csv",
-        time="t_s",
-        inputs={"command": ehsvjax.Column("valve_cmd_V", scale=1e-4)},
-        outputs={"position": ehsvjax.Column("position_raw_V", scale=0.02, offset=-0.0055)},
-    )
+    record = _read(name, offset=-0.0055)
     command, position = record.inputs["command"], record.outputs["position"]
     position = np.where(position > 0.194, np.nan, position)
 
@@ -86,12 +91,8 @@ def _out_and_back(name):
 )
 def test_of_one_run_out_and_back_two_areas_or_a_load_are_in_the_answer_and_other_voltages_are_predicted():
     """A rod makes the areas two; any bias, with a dead zone beside it, explains one voltage and predicts no other."""
-    piston, rod = np.pi / 4 * 0.016**2, np.pi / 4 * 0.010**2
-    model = ehsvjax.servovalve(
-        open_loop=True, piston_area=piston - rod / 2, supply_pressure=4.35e6, mass=1.0, stiffness=0.0
-    )
     one_run = _out_and_back("pA_3V_s01")
-    stopped = ehsvjax.effects.attach(model, STOPS, duration=one_run.time[-1], bank=ehsvjax.effects.BANK)
+    stopped = ehsvjax.effects.attach(_valve(), STOPS, duration=one_run.time[-1], bank=ehsvjax.effects.BANK)
     hardness = {name: 1e7 for name in STOPS if name.endswith("stiffness")}
     settings = SETTINGS | {
         "population": 40,
