@@ -84,11 +84,6 @@ def _out_and_back(name):
 
 
 @pytest.mark.thorough
-@pytest.mark.xfail(
-    strict=True,
-    reason="from the ratio of the areas, found first, three causes are reached that explain no more than two areas and "
-    "a backlash do: of what is swapped in for one cause it is not asked whether another is needless then",
-)
 def test_of_one_run_out_and_back_two_areas_or_a_load_are_in_the_answer_and_other_voltages_are_predicted():
     """A rod makes the areas two; any bias, with a dead zone beside it, explains one voltage and predicts no other."""
     one_run = _out_and_back("pA_3V_s01")

@@ -101,8 +101,8 @@ def test_rivals_of_which_each_is_better_under_the_noise_of_the_other_are_looked_
         looked.append(included)
         return Looked(trials, included, current, noise)
 
-    def swapped(trials, included, current, *_):
-        return ("b",) if included == ("a",) else ("a",), current, ()
+    def swapped(stage, *_):
+        return ("b",) if stage.included == ("a",) else ("a",), stage.current, ()
 
     for name, stub in {
         "_from_nominal_starts_too": lambda stage: stage.current,

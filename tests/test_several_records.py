@@ -140,9 +140,9 @@ def test_what_one_record_alone_has_is_named_of_that_record(tmp_path, monkeypatch
     """Together a parameter that changed, certain, and a random force stood for it; their rivals took half an hour."""
     weighed, weigh = [], search.rivals_of_all
 
-    def watched(trials, included, *rest):
-        weighed.append((len(trials.bench.records), included))
-        return weigh(trials, included, *rest)
+    def watched(stage):
+        weighed.append((len(stage.trials.bench.records), stage.included))
+        return weigh(stage)
 
     monkeypatch.setattr(search, "rivals_of_all", watched)
     limited = {"input_saturation": {"limit": 0.6}}

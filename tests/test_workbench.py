@@ -16,7 +16,8 @@ from ehsvjax.diagnosis.bench.refits import not_made_up_for, padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
 from ehsvjax.diagnosis.decision.rivals import Rival, rivals_again
-from ehsvjax.diagnosis.decision.search import Stage, _from_nominal_starts_too, _look, _settled, _weighed
+from ehsvjax.diagnosis.decision.search import _from_nominal_starts_too, _look, _settled, _weighed
+from ehsvjax.diagnosis.decision.stage import Stage
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_set, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
 from ehsvjax.diagnosis.hypotheses.process_noise import process_noise
@@ -269,7 +270,7 @@ def test_what_has_taken_one_causes_place_is_no_rival_of_another(bench):
     noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
     both = refit_sets(trials, [[bench.nominal]], [(one, other)], noise)
     groups = ((Rival(one, 0.0, both), Rival(other, 1.0, both)), (Rival(other, 0.0, both), Rival(one, 1.0, both)))
-    included, _, found = rivals_again(trials, (one, other), both, groups, noise)
+    included, _, found = rivals_again(_look(trials, (one, other), both, noise), groups)
     assert [[rival.candidate for rival in group] for group in found] == [[cause] for cause in included]
 
 

@@ -11,6 +11,7 @@ from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.prediction import predicted
+from ehsvjax.diagnosis.decision.stage import Stage
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -47,87 +48,99 @@ class Rival(NamedTuple):
     refitted: Refits
 
 
-def rivals_of_all(
-    trials: Trials, included: tuple[int, ...], final: Refits, noise: Noise
-) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
+def rivals_of_all(stage: Stage) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
     """Return the effects after swaps for better rivals, their refit, and for each all that could be there instead."""
     groups: dict[int, tuple[Rival, ...]] = {}
-    swaps, waiting = 0, list(included)
+    swaps, waiting = 0, list(stage.included)
     while waiting:
         own = waiting.pop(0)
-        group = _rivals_of(trials, own, tuple(j for j in included if j != own), final, noise)
+        group = _rivals_of(stage, own)
         best = group[0]
-        if swaps < _SWAPS and (best.candidate != own or _cost(best.refitted) < _cost(final) - _LOWER):
+        if swaps < _SWAPS and (best.candidate != own or _cost(best.refitted) < _cost(stage.current) - _LOWER):
             # The others are looked at anew, beside what is better.
             swaps += 1
-            included, final = tuple(best.candidate if j == own else j for j in included), best.refitted
-            waiting = [j for j in included if j != best.candidate]
+            stage = _swapped(stage, own, best)
+            waiting = [j for j in stage.included if j != best.candidate]
             own = best.candidate
         groups[own] = group
-    return included, final, tuple(groups[i] for i in included)
+    return stage.included, stage.current, tuple(groups[i] for i in stage.included)
 
 
 def rivals_again(
-    trials: Trials, included: tuple[int, ...], final: Refits, groups: Sequence[Sequence[Rival]], noise: Noise
+    stage: Stage, groups: Sequence[Sequence[Rival]]
 ) -> tuple[tuple[int, ...], Refits, tuple[tuple[Rival, ...], ...]]:
     """Return the same as `rivals_of_all` from where all have been refitted, under another step or noise."""
     ranked = []
-    for own, group in zip(included, groups, strict=True):
-        rest = tuple(j for j in included if j != own)
+    for own, group in zip(stage.included, groups, strict=True):
+        rest = _without(stage.included, own)
         # Beside what has been swapped in for another cause, some have too many numbers.
-        able = [r for r in group if r.candidate not in included and fits(trials.bench, (*rest, r.candidate))]
-        found = _refitted_beside(trials, final, able, rest, noise)
-        ranked.append(_ranked(trials, own, rest, {own: final} | found, noise))
-    for own, group in zip(included, ranked, strict=True):
+        others = [r for r in group if r.candidate not in stage.included]
+        able = [r for r in others if fits(stage.trials.bench, (*rest, r.candidate))]
+        ranked.append(_ranked(stage, own, {own: stage.current} | _refitted_beside(stage, able, rest)))
+    for own, group in zip(stage.included, ranked, strict=True):
         if group[0].candidate != own:
-            included, final = tuple(group[0].candidate if j == own else j for j in included), group[0].refitted
+            stage = _swapped(stage, own, group[0])
             break
     # What has taken one cause's place is no rival of another.
-    of_each = [tuple(r for r in group if r.candidate not in included or r is group[0]) for group in ranked]
-    return included, final, tuple(of_each)
+    of_each = [tuple(r for r in group if r.candidate not in stage.included or r is group[0]) for group in ranked]
+    return stage.included, stage.current, tuple(of_each)
 
 
-def _refitted_beside(
-    trials: Trials, final: Refits, rivals: Sequence[Rival], rest: tuple[int, ...], noise: Noise
-) -> dict[int, Refits]:
-    """Return rivals refitted from where each was, and from where all else is as it is in another refit.
+def _swapped(stage: Stage, own: int, rival: Rival) -> Stage:
+    """Return the stage with a rival in the place of a cause; what else could be there is as it was."""
+    included = tuple(rival.candidate if j == own else j for j in stage.included)
+    return stage._replace(included=included, current=rival.refitted)
+
+
+def _without(included: Sequence[int], own: int) -> tuple[int, ...]:
+    return tuple(j for j in included if j != own)
+
+
+def _refitted_beside(stage: Stage, rivals: Sequence[Rival], rest: tuple[int, ...]) -> dict[int, Refits]:
+    """Return rivals refitted from where each was, and from where all else is as it is in the stage's refit.
 
     Two that do the same are else told apart by the local minimum of the model's own unknowns that each has come to, or
     by how far the other has gone on along a flat valley.
     """
     if not rivals:
         return {}
-    starts = []
+    bench, starts = stage.trials.bench, []
     for rival in rivals:
-        own, there = trials.bench.columns_of(trials.bench.candidates[rival.candidate]), final.points[0].copy()
+        own, there = bench.columns_of(bench.candidates[rival.candidate]), stage.current.points[0].copy()
         there[own] = rival.refitted.points[0][own]
         starts.append([rival.refitted.points[0], there])
-    led = refit_sets(trials, starts, [(*rest, r.candidate) for r in rivals], noise, race=True)
+    led = refit_sets(stage.trials, starts, [(*rest, r.candidate) for r in rivals], stage.noise, race=True)
     return {r.candidate: led.of([k]) for k, r in enumerate(rivals)}
 
 
-def _rivals_of(trials: Trials, own: int, rest: tuple[int, ...], final: Refits, noise: Noise) -> tuple[Rival, ...]:
+def _rivals_of(stage: Stage, own: int) -> tuple[Rival, ...]:
     """Return what was refitted in the place of one effect, the best first."""
-    bench = trials.bench
-    start = with_only(bench, final.points[0], rest)
+    trials, final, noise = stage.trials, stage.current, stage.noise
+    rest = _without(stage.included, own)
+    start = with_only(trials.bench, final.points[0], rest)
     current = refit_set(trials, start, rest, noise)
     base = _beside(trials, start, current, noise) if rest else current
     # From where the model is without the cause, and from where it is with it: a rival may do just the same.
     found = _refitted_from(trials, base, own, rest, noise, start)
-    group = _ranked(trials, own, rest, found | {own: min(found.get(own, final), final, key=_cost)}, noise)
+    group = _ranked(stage, own, found | {own: min(found.get(own, final), final, key=_cost)})
     best, *others = (r for r in group if r.deficit < _WORTH_A_REFIT)
-    again = _refitted_beside(trials, best.refitted, others, rest, noise)
-    return _ranked(trials, own, rest, {r.candidate: r.refitted for r in group} | again, noise) if again else group
+    again = _refitted_beside(stage._replace(current=best.refitted), others, rest)
+    return _ranked(stage, own, {r.candidate: r.refitted for r in group} | again) if again else group
 
 
-def _ranked(
-    trials: Trials, own: int, rest: tuple[int, ...], found: Mapping[int, Refits], noise: Noise
-) -> tuple[Rival, ...]:
+def _ranked(stage: Stage, own: int, found: Mapping[int, Refits]) -> tuple[Rival, ...]:
     """Return what was refitted in the place of an effect, the best first, with how much worse each is.
 
-    What would take its place, and has unused data against it by more than chance, is no rival.
+    No rival is what chance could gain as well, where the effect surely gains more; nor what would take its place, and
+    has unused data against it by more than chance.
     """
+    trials, noise, rest = stage.trials, stage.noise, _without(stage.included, own)
     able = {candidate: refitted for candidate, refitted in found.items() if np.isfinite(_cost(refitted))}
+    neither = refit_set(trials, able[own].points[0], rest, noise)
+    gains = {candidate: noise.gained(neither.residual[0], able[candidate].residual[0]) for candidate in able}
+    for candidate, gain in gains.items():
+        if gain < min(stage.required_gain(candidate), gains[own] - INSEPARABLE):
+            del able[candidate]
     prices = {candidate: price(trials.bench, candidate, refitted.points[0]) for candidate, refitted in able.items()}
 
     def behind(best: int) -> dict[int, float]:
@@ -137,17 +150,23 @@ def _ranked(
             for candidate, refitted in able.items()
         }
 
+    best, been = own, {own}
     while True:
-        lowest = behind(min(able, key=lambda candidate: _cost(able[candidate])))
-        best = min(lowest, key=lambda candidate: lowest[candidate])
+        deficits = behind(best)
+        better = min(deficits, key=lambda candidate: deficits[candidate])
         # As good but for rounding: no reason to swap.
-        best = own if lowest[own] < lowest[best] + 1e-3 else best
-        if best == own:
+        if not deficits[better] < -1e-3:
             break
-        unused = predicted(trials.bench, [(*rest, own), (*rest, best)], [able[own], able[best]], noise)
-        if not unused.against(1, 0) > INSEPARABLE:
+        if better in been:
+            # Each of them is better than another, as what they leave differs: none is the best.
+            best = own
             break
-        del able[best]
+        unused = predicted(trials.bench, [(*rest, best), (*rest, better)], [able[best], able[better]], noise)
+        if unused.against(1, 0) > INSEPARABLE:
+            del able[better]
+        else:
+            best = better
+            been.add(better)
     ranked = sorted(behind(best).items(), key=lambda pair: (pair[0] != best, pair[1]))
     return tuple(Rival(candidate, max(0.0, deficit), able[candidate]) for candidate, deficit in ranked)
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ehsvjax.arithmetic import finest
-from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, PER_NUMBER, SIGNIFICANT
+from ehsvjax.diagnosis.bench.evidence import INSEPARABLE, SIGNIFICANT
 from ehsvjax.diagnosis.bench.jumps import without_jumps
 from ehsvjax.diagnosis.bench.noise import Noise, noise_outside, plain_noise
 from ehsvjax.diagnosis.bench.progress import Progress
@@ -16,6 +16,7 @@ from ehsvjax.diagnosis.bench.refits import Refits, not_made_up_for
 from ehsvjax.diagnosis.bench.workbench import Workbench, same_readings, settled
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
+from ehsvjax.diagnosis.decision.stage import Stage
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -26,7 +27,7 @@ from ehsvjax.diagnosis.decision.trials import (
     refit_sets,
     trials_of,
 )
-from ehsvjax.diagnosis.hypotheses.screening import Screened, Screening, responses_at, screen
+from ehsvjax.diagnosis.hypotheses.screening import Screened, responses_at, screen
 
 _MOST_EFFECTS = 3
 # Rounds of swaps and new looks, in which causes, noise and arithmetic settle.
@@ -34,24 +35,6 @@ _ROUNDS = 6
 # Deficit of rivals whose arithmetic a verdict stands on; beyond, a part of it is enough, and none takes the place of
 # what is ahead of it by so much.
 _WEIGHED = 25.0
-
-
-class Stage(NamedTuple):
-    """One look at what is left: the refit that it started from, the noise, and the candidates' scores.
-
-    Its trials have the step that arithmetic needs there, and the readings that it knows.
-    """
-
-    trials: Trials
-    included: tuple[int, ...]
-    current: Refits
-    noise: Noise
-    screening: Screening
-
-    @property
-    def leaves_something(self) -> bool:
-        """Whether a candidate is significant on what is left."""
-        return bool(self.screening.ranked) and self.screening.ranked[0].corrected < SIGNIFICANT
 
 
 class Integration(NamedTuple):
@@ -175,7 +158,7 @@ def select(bench: Workbench, found: Sequence[Stage]) -> Selection:
             look = _next_effect(last)
         elif included not in replaced and len(replaced) < _ROUNDS:
             replaced.add(included)
-            look = _two_in_the_place_of_one(weighed)
+            look = _instead_of_what_is_there(weighed)
             if look is None:
                 break
         else:
@@ -185,20 +168,53 @@ def select(bench: Workbench, found: Sequence[Stage]) -> Selection:
     return _selection(bench, stages, weighed)
 
 
-def _two_in_the_place_of_one(weighed: "_Weighed") -> Stage | None:
-    """Return the look with the nearest rival of any cause in its place and one effect more, if nothing is left then.
+def _instead_of_what_is_there(weighed: "_Weighed") -> Stage | None:
+    """Return the look with a near rival in the place of a cause, where that changes how many causes there need be.
 
-    What acts alone like two causes together, but for a little, comes before either of them, and leaves too little for
-    a further one to gain much beside it.
+    What acts like two causes together, but for a little, may come before either of them, and once it is there, too
+    little is left for another to gain much beside it. What came before may likewise need two others to make up for what
+    it is not.
     """
+    near = [(k, r) for k, group in enumerate(weighed.rivals) for r in group[1:] if r.deficit < _WEIGHED]
+    return _one_in_the_place_of_two(weighed, near) or _two_in_the_place_of_one(weighed, near)
+
+
+def _one_in_the_place_of_two(weighed: "_Weighed", near: Sequence[tuple[int, Rival]]) -> Stage | None:
+    """Return the look with a rival in the place of one cause and without another, if that is needless then."""
     stage = weighed.stage
-    near = {k: [r for r in group[1:] if r.deficit < _WEIGHED] for k, group in enumerate(weighed.rivals)}
-    rivals = {k: some[0] for k, some in near.items() if some}
-    if not stage.leaves_something or not rivals:
+    trials, noise, final = stage.trials, stage.noise, stage.current
+    tried: dict[tuple[int, ...], list[tuple[float, Rival]]] = {}
+    for k, rival in near:
+        for other in {*stage.included} - {stage.included[k]}:
+            instead = tuple(rival.candidate if j == stage.included[k] else j for j in stage.included if j != other)
+            needed = stage.required_gain(other)
+            dearer = rival.deficit - noise.gained(rival.refitted.residual[0], final.residual[0])
+            tried.setdefault(instead, []).append((needed - dearer, rival))
+    if not tried:
         return None
-    place = min(rivals, key=lambda k: rivals[k].deficit)
-    instead = tuple(rivals[k].candidate if k == place else j for k, j in enumerate(stage.included))
-    found = _next_effect(_look(stage.trials, instead, rivals[place].refitted, stage.noise))
+    sets = list(tried)
+    starts = [[rival.refitted.points[0] for _, rival in tried[instead]] for instead in sets]
+    refitted = refit_sets(trials, starts, sets, noise, race=True)
+    spare = []
+    for instead, residual in zip(sets, refitted.residual, strict=True):
+        spare.append(max(needed for needed, _ in tried[instead]) - noise.gained(residual, final.residual[0]))
+    best = int(np.argmax(spare))
+    if not spare[best] > 0.0:
+        return None
+    unused = predicted(trials.bench, [stage.included, sets[best]], [final, refitted.of([best])], noise)
+    if unused.against(1, 0) > INSEPARABLE:
+        return None
+    return _look(trials, sets[best], refitted.of([best]), noise)
+
+
+def _two_in_the_place_of_one(weighed: "_Weighed", near: Sequence[tuple[int, Rival]]) -> Stage | None:
+    """Return the look with the nearest rival of any cause in its place and one effect more, if nothing is left then."""
+    stage = weighed.stage
+    if not stage.leaves_something or not near:
+        return None
+    place, rival = min(near, key=lambda one: one[1].deficit)
+    instead = tuple(rival.candidate if k == place else j for k, j in enumerate(stage.included))
+    found = _next_effect(_look(stage.trials, instead, rival.refitted, stage.noise))
     return None if found is None or found.leaves_something else found
 
 
@@ -260,8 +276,7 @@ class _Weighed(NamedTuple):
 def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
     """Refit what could be there instead of each cause, and settle the arithmetic for all that is compared."""
     looked_at = {frozenset(stage.included)}
-    final = _from_nominal_starts_too(stage)
-    included, final, rivals = rivals_of_all(stage.trials, stage.included, final, stage.noise)
+    included, final, rivals = rivals_of_all(stage._replace(current=_from_nominal_starts_too(stage)))
     for rounds_left in reversed(range(_ROUNDS)):
         stage = stage._replace(included=included, current=final)
         trials, noise = stage.trials, stage.noise
@@ -273,7 +288,7 @@ def _weighed(stage: Stage, nominal: Refits) -> _Weighed:
         # Nothing is searched again: what was found is refitted from where it is, under the noise that is left now.
         stage = _look(trials._replace(bench=known), included, final, noise, int(known.problem.substeps))
         looked_at.add(frozenset(included))
-        included, final, rivals = rivals_again(stage.trials, included, stage.current, rivals, stage.noise)
+        included, final, rivals = rivals_again(stage, rivals)
     needs, unused = _needs(stage, nominal)
     return _Weighed(stage, nominal, rivals, needs, unused, _needless(included, needs, unused), worth)
 
@@ -341,13 +356,6 @@ def _integration(begun: Workbench, ended: Workbench, worth: float) -> Integratio
 def _compared(final: Refits, nominal: Refits, rivals: Sequence[Sequence[Rival]]) -> list[Refits]:
     """Return the refits of all explanations that a verdict weighs against each other."""
     return [final, nominal, *(r.refitted for group in rivals for r in group if r.deficit < _WEIGHED)]
-
-
-def required_gain(bench: Workbench, screening: Screening, candidate: int) -> float:
-    """Return the likelihood ratio that an effect must bring, in noise variances, for the search that found it."""
-    if searched := bench.search_of(candidate):
-        return searched - 2.0 * float(np.log(SIGNIFICANT)) + PER_NUMBER
-    return screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
 
 
 def _look(
@@ -434,7 +442,7 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
             np.isfinite(cost)
             and stage.noise.in_variances(
                 float(stage.current.cost[0] - cost), stage.current.residual[0], residual
-            )[0] > required_gain(bench, stage.screening, s.candidate)
+            )[0] > stage.required_gain(s.candidate)
             for s, cost, residual in zip(some, refitted.cost, refitted.residual, strict=True)
         ]  # fmt: skip
         if not any(enough):
@@ -470,7 +478,7 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
         needs.append(Need(
             gain=noise.gained(*both),
             of_record=tuple(noise.of_record(k).gained(*both) for k in range(len(trials.bench.records))),
-            required=required_gain(trials.bench, stage.screening, i),
+            required=stage.required_gain(i),
         ))  # fmt: skip
     if len(stage.included) > 1:
         sets.append(())

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ehsvjax.diagnosis.decision.search import Selection, required_gain
+from ehsvjax.diagnosis.decision.search import Selection
 from ehsvjax.diagnosis.results.diagnosis import Excluded
 from ehsvjax.effects.effect import UNLIMITED
 
@@ -83,7 +83,7 @@ def _detectable(selection: Selection) -> dict[int, float]:
     # The last look comes last: at a cause the one before it was added.
     for stage in selection.stages:
         for s in stage.screening.ranked:
-            needed = np.sqrt(required_gain(selection.bench, stage.screening, s.candidate)) + _POWER_QUANTILE
+            needed = np.sqrt(stage.required_gain(s.candidate)) + _POWER_QUANTILE
             found[s.candidate] = _least_size(s.shown, s.proportional, float(needed))
     for i in selection.stages[-1].screening.unseen:
         found.pop(i, None)
