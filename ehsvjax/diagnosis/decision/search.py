@@ -159,8 +159,6 @@ def select(bench: Workbench, found: Sequence[Stage]) -> Selection:
         elif included not in replaced and len(replaced) < _ROUNDS:
             replaced.add(included)
             look = _instead_of_what_is_there(weighed)
-            if look is None:
-                break
         else:
             break
         if look is not None:
@@ -185,19 +183,20 @@ def _one_in_the_place_of_two(weighed: "_Weighed", near: Sequence[tuple[int, Riva
     trials, noise, final = stage.trials, stage.noise, stage.current
     tried: dict[tuple[int, ...], list[tuple[float, Rival]]] = {}
     for k, rival in near:
-        for other in {*stage.included} - {stage.included[k]}:
-            instead = tuple(rival.candidate if j == stage.included[k] else j for j in stage.included if j != other)
-            needed = stage.required_gain(other)
-            dearer = rival.deficit - noise.gained(rival.refitted.residual[0], final.residual[0])
-            tried.setdefault(instead, []).append((needed - dearer, rival))
+        own = stage.included[k]
+        dearer = _price(trials, rival.candidate, rival.refitted) - _price(trials, own, final)
+        for other in {*stage.included} - {own}:
+            instead = tuple(rival.candidate if j == own else j for j in stage.included if j != other)
+            tried.setdefault(instead, []).append((stage.required_gain(other) - dearer, rival))
     if not tried:
         return None
     sets = list(tried)
     starts = [[rival.refitted.points[0] for _, rival in tried[instead]] for instead in sets]
     refitted = refit_sets(trials, starts, sets, noise, race=True)
-    spare = []
-    for instead, residual in zip(sets, refitted.residual, strict=True):
-        spare.append(max(needed for needed, _ in tried[instead]) - noise.gained(residual, final.residual[0]))
+    spare = [
+        max(needed for needed, _ in tried[instead]) - noise.gained(residual, final.residual[0])
+        for instead, residual in zip(sets, refitted.residual, strict=True)
+    ]
     best = int(np.argmax(spare))
     if not spare[best] > 0.0:
         return None
@@ -460,6 +459,10 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
             if not best.leaves_something:
                 break
     return best
+
+
+def _price(trials: Trials, candidate: int, refitted: Refits) -> float:
+    return price(trials.bench, candidate, refitted.points[0])
 
 
 def _cost_under(refits: Refits, noise: Noise) -> float:
