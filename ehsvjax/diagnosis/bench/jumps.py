@@ -44,17 +44,15 @@ def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
     errors = _ERRORS * vectors[:, kept] / values[kept] / norms[seen, None]
     moved = columns[seen]
     lower, upper = bench.bounds
-    steps = np.concatenate([errors.T, -errors.T])
-    points = np.repeat(point[None], 1 + 2 * len(steps), axis=0)
-    points[1:, moved] = np.clip(point[moved] + np.concatenate([steps, 0.5 * steps]), lower[moved], upper[moved])
+    over = [point[moved] + step for step in np.concatenate([errors.T, -errors.T, 0.5 * errors.T, -0.5 * errors.T])]
+    points = np.repeat(point[None], 1 + len(over), axis=0)
+    points[1:, moved] = np.clip(over, lower[moved], upper[moved])
     outputs = bench.simulated(points)
     whole, half = (np.sum(np.split(side, 2), axis=0) - 2.0 * outputs[0] for side in np.split(outputs[1:], 2))
     deviations = np.sqrt(noise.innovation_variances)[:, None]
     broken = np.max(np.abs(0.25 * whole - half), axis=0) / deviations > _STRAIGHT
     # Steps smear a jump over their length: what comes before the next reading looks smooth, and shorter ones move it.
-    ends = slice(0, 1 + len(steps))
-    finer = bench.simulated(points[ends], substeps=_FINER * int(bench.problem.substeps))
-    smeared = np.max(np.abs(finer - outputs[ends]), axis=0)
+    smeared = np.max(np.abs(bench.simulated(points, substeps=_FINER * int(bench.problem.substeps)) - outputs), axis=0)
     # More than the others: the first reading of a bend that begins bends less.
     alone = [standing_out(smeared[..., i] / deviations[..., i], _STRAIGHT) for i in range(smeared.shape[-1])]
     jumping = samples.measured & (broken | np.stack(alone, axis=-1))
