@@ -2,9 +2,8 @@
 
 A load pressure jumps as the spool leaves its dead zone. Where a reading lies within what the unknowns' own errors make
 of that moment, the sum of squares has a step, a refit ends where it happens to stand, and a cause that moves the jump
-by a microsecond seems to be there. The same where a piston rests in its dead zone, and its friction may be of either
-sign. Such a reading is not smooth within the errors: over half of them it does not bend by a quarter. It carries no
-weight.
+by a microsecond seems to be there. Such a reading is not straight within the errors, and its neighbours are: it carries
+no weight. A smooth bend has neighbours that bend as well.
 """
 
 import numpy as np
@@ -16,7 +15,7 @@ from ehsvjax.diagnosis.bench.workbench import TOLD_APART, Workbench, with_readin
 from ehsvjax.readings import standing_out
 
 # Standard errors of the unknowns over which a jump is looked for: of many jumps a third lie beyond one of them. And
-# deviations of the noise by which a reading may bend otherwise than a square does, or more than its neighbours.
+# deviations of the noise by which a reading may bend over them, more than its neighbours.
 _ERRORS, _STRAIGHT = 3.0, 0.3
 # Times as many steps that tell what a jump looks like.
 _FINER = 4
@@ -44,18 +43,17 @@ def without_jumps(bench: Workbench, current: Refits, noise: Noise) -> Workbench:
     errors = _ERRORS * vectors[:, kept] / values[kept] / norms[seen, None]
     moved = columns[seen]
     lower, upper = bench.bounds
-    over = [point[moved] + step for step in np.concatenate([errors.T, -errors.T, 0.5 * errors.T, -0.5 * errors.T])]
-    points = np.repeat(point[None], 1 + len(over), axis=0)
-    points[1:, moved] = np.clip(over, lower[moved], upper[moved])
+    points = np.repeat(point[None], 1 + 2 * errors.shape[1], axis=0)
+    points[1:, moved] = np.clip(point[moved] + np.concatenate([errors.T, -errors.T]), lower[moved], upper[moved])
     outputs = bench.simulated(points)
-    whole, half = (np.sum(np.split(side, 2), axis=0) - 2.0 * outputs[0] for side in np.split(outputs[1:], 2))
+    forward, backward = np.split(outputs[1:], 2)
     deviations = np.sqrt(noise.innovation_variances)[:, None]
-    broken = np.max(np.abs(0.25 * whole - half), axis=0) / deviations > _STRAIGHT
     # Steps smear a jump over their length: what comes before the next reading looks smooth, and shorter ones move it.
     smeared = np.max(np.abs(bench.simulated(points, substeps=_FINER * int(bench.problem.substeps)) - outputs), axis=0)
+    bent = np.maximum(np.max(np.abs(forward + backward - 2.0 * outputs[0]), axis=0), smeared) / deviations
     # More than the others: the first reading of a bend that begins bends less.
-    alone = [standing_out(smeared[..., i] / deviations[..., i], _STRAIGHT) for i in range(smeared.shape[-1])]
-    jumping = samples.measured & (broken | np.stack(alone, axis=-1))
+    alone = [standing_out(bent[..., i], _STRAIGHT) for i in range(bent.shape[-1])]
+    jumping = samples.measured & np.stack(alone, axis=-1)
     # More than that no jump bends.
     if not jumping.any() or not few(jumping, samples.measured, LEFT_OUT):
         return bench
