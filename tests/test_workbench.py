@@ -72,7 +72,7 @@ def test_derivatives_are_those_of_jax_at_effects_present_and_absent(bench):
     columns = bench.columns_with([present, absent])
     point = bench.nominal.copy()
     point[bench.columns_of(bench.candidates[present])] = 3.0
-    outputs, slopes = bench.linearised(point[None], np.array([[*columns, -1, -1]]))
+    outputs, slopes = bench.linearised(point[None], padded([columns], len(columns) + 2))
     with jax.enable_x64(True):
         problem = cast(bench.problem, jnp.float64)
         here = jnp.asarray(point)
@@ -172,7 +172,7 @@ def test_unknowns_beside_a_curve_make_up_for_what_they_can(bench):
     curve = straight_along(bench, "force", "position", quantities(bench), 9)
     # A stiffness that the plant has not: the unknowns lessen what it does, and cannot undo it.
     acting = bench_with(bench, curve, 20.0 * curve.knots)
-    start, columns = bench.nominal[None], padded([bench.base_columns])
+    start, columns = bench.nominal[None], padded([bench.base_columns], len(bench.base_columns))
     free, beside = (refit(b, start, columns, noise, race=False) for b in (bench, acting))
     at_once = noise.scaled(acting.problem.samples.outputs - acting.simulated(start)[0])
     assert free.cost[0] <= beside.cost[0] < float(at_once @ at_once)
@@ -204,7 +204,7 @@ def test_nothing_is_known_of_a_disturbance_that_lets_the_model_run_away(bench):
     assert np.isfinite(bench.sketched(at(middle)[None])).all()
     assert np.isfinite(parts_at(bench, at(middle), "force").responses).all()
     noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
-    there = refit(bench, at(middle)[None], padded([bench.base_columns]), noise, iterations=1)
+    there = refit(bench, at(middle)[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
     found = process_noise(bench, there, noise)
     assert found is None or np.isfinite(found.likelihood)
 

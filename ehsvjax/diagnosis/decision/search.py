@@ -20,6 +20,7 @@ from ehsvjax.diagnosis.decision.stage import Stage
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
+    fits,
     refit_reshaped,
     refit_screened,
     refit_set,
@@ -413,7 +414,9 @@ def _next_effect(stage: Stage) -> Stage | None:
     if len(stage.included) == _MOST_EFFECTS:
         return None
     bench = stage.trials.bench
-    hopeful = [s for s in stage.screening.ranked if s.corrected < SIGNIFICANT]
+    hopeful = [
+        s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
+    ]
     shared = _best_of(stage, [s for s in hopeful if not bench.of_each(s.candidate)])
     own = _best_of(stage, [s for s in hopeful if bench.of_each(s.candidate)])
     if shared is None or own is None:
