@@ -11,7 +11,7 @@ from ehsvjax.diagnosis.bench.noise import Noise
 from ehsvjax.diagnosis.bench.refits import Refits, padded, refit
 from ehsvjax.diagnosis.bench.workbench import Workbench
 from ehsvjax.diagnosis.decision.prediction import predicted
-from ehsvjax.diagnosis.decision.stage import Stage
+from ehsvjax.diagnosis.decision.stage import Stage, all_but, with_instead
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -72,7 +72,7 @@ def rivals_again(
     """Return the same as `rivals_of_all` from where all have been refitted, under another step or noise."""
     ranked = []
     for own, group in zip(stage.included, groups, strict=True):
-        rest = _without(stage.included, own)
+        rest = all_but(stage.included, own)
         # Beside what has been swapped in for another cause, some have too many numbers.
         others = [r for r in group if r.candidate not in stage.included]
         able = [r for r in others if fits(stage.trials.bench, (*rest, r.candidate))]
@@ -88,12 +88,7 @@ def rivals_again(
 
 def _swapped(stage: Stage, own: int, rival: Rival) -> Stage:
     """Return the stage with a rival in the place of a cause; what else could be there is as it was."""
-    included = tuple(rival.candidate if j == own else j for j in stage.included)
-    return stage._replace(included=included, current=rival.refitted)
-
-
-def _without(included: Sequence[int], own: int) -> tuple[int, ...]:
-    return tuple(j for j in included if j != own)
+    return stage._replace(included=with_instead(stage.included, own, rival.candidate), current=rival.refitted)
 
 
 def _refitted_beside(stage: Stage, rivals: Sequence[Rival], rest: tuple[int, ...]) -> dict[int, Refits]:
@@ -116,7 +111,7 @@ def _refitted_beside(stage: Stage, rivals: Sequence[Rival], rest: tuple[int, ...
 def _rivals_of(stage: Stage, own: int) -> tuple[Rival, ...]:
     """Return what was refitted in the place of one effect, the best first."""
     trials, final, noise = stage.trials, stage.current, stage.noise
-    rest = _without(stage.included, own)
+    rest = all_but(stage.included, own)
     start = with_only(trials.bench, final.points[0], rest)
     current = refit_set(trials, start, rest, noise)
     base = _beside(trials, start, current, noise) if rest else current
@@ -134,7 +129,7 @@ def _ranked(stage: Stage, own: int, found: Mapping[int, Refits]) -> tuple[Rival,
     No rival is what chance could gain as well, where the effect surely gains more; nor what would take its place, and
     has unused data against it by more than chance.
     """
-    trials, noise, rest = stage.trials, stage.noise, _without(stage.included, own)
+    trials, noise, rest = stage.trials, stage.noise, all_but(stage.included, own)
     able = {candidate: refitted for candidate, refitted in found.items() if np.isfinite(_cost(refitted))}
     neither = refit_set(trials, able[own].points[0], rest, noise)
     gains = {candidate: noise.gained(neither.residual[0], able[candidate].residual[0]) for candidate in able}

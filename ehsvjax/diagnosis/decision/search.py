@@ -16,7 +16,7 @@ from ehsvjax.diagnosis.bench.refits import Refits, not_made_up_for
 from ehsvjax.diagnosis.bench.workbench import Workbench, same_readings, settled
 from ehsvjax.diagnosis.decision.prediction import Predicted, predicted
 from ehsvjax.diagnosis.decision.rivals import Rival, price, rivals_again, rivals_of_all
-from ehsvjax.diagnosis.decision.stage import Stage
+from ehsvjax.diagnosis.decision.stage import Stage, all_but, with_instead
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
@@ -186,7 +186,7 @@ def _one_in_the_place_of_two(weighed: "_Weighed", near: Sequence[tuple[int, Riva
         own = stage.included[k]
         dearer = _price(trials, rival.candidate, rival.refitted) - _price(trials, own, final)
         for other in {*stage.included} - {own}:
-            instead = tuple(rival.candidate if j == own else j for j in stage.included if j != other)
+            instead = all_but(with_instead(stage.included, own, rival.candidate), other)
             tried.setdefault(instead, []).append((stage.required_gain(other) - dearer, rival))
     if not tried:
         return None
@@ -212,7 +212,7 @@ def _two_in_the_place_of_one(weighed: "_Weighed", near: Sequence[tuple[int, Riva
     if not stage.leaves_something or not near:
         return None
     place, rival = min(near, key=lambda one: one[1].deficit)
-    instead = tuple(rival.candidate if k == place else j for k, j in enumerate(stage.included))
+    instead = with_instead(stage.included, stage.included[place], rival.candidate)
     found = _next_effect(_look(stage.trials, instead, rival.refitted, stage.noise))
     return None if found is None or found.leaves_something else found
 
@@ -474,7 +474,7 @@ def _needs(stage: Stage, nominal: Refits) -> tuple[tuple[Need, ...], Predicted]:
     trials, final, noise = stage.trials, stage.current, stage.noise
     sets, refits, needs = [stage.included], [final], []
     for i in stage.included:
-        rest = tuple(j for j in stage.included if j != i)
+        rest = all_but(stage.included, i)
         sets.append(rest)
         refits.append(refit_set(trials, final.points[0] if rest else nominal.points[0], rest, noise))
         both = refits[-1].residual[0], final.residual[0]

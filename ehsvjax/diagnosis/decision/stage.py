@@ -1,5 +1,6 @@
 """One look at what is left beside some causes: the refit with them, the noise, the scores of all other candidates."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -34,3 +35,13 @@ class Stage(NamedTuple):
         if searched := bench.search_of(candidate):
             return searched - 2.0 * float(np.log(SIGNIFICANT)) + PER_NUMBER
         return self.screening.threshold**2 + PER_NUMBER * (bench.numbers_of(candidate) - 1)
+
+
+def with_instead(included: Sequence[int], own: int, candidate: int) -> tuple[int, ...]:
+    """Return effects with another in the place of one of them."""
+    return tuple(candidate if j == own else j for j in included)
+
+
+def all_but(included: Sequence[int], own: int) -> tuple[int, ...]:
+    """Return effects but for one of them."""
+    return tuple(j for j in included if j != own)
