@@ -13,7 +13,7 @@ from ehsvjax.diagnosis.bench.noise import plain_noise
 from ehsvjax.diagnosis.bench.refits import padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import Workbench
-from ehsvjax.diagnosis.decision.trials import most_unknowns, refit_sets, trials_of
+from ehsvjax.diagnosis.decision.trials import refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.screening import responses_at, screen
 from ehsvjax.effects import BANK
 from tests.plants import Valve, held_levels, servovalve_plant
@@ -61,7 +61,7 @@ def led_to(bench, constant):
     (column,) = bench.columns_of(bench.candidates[screened.candidate])
     starts = np.repeat(screened.start[None], len(SHARES), axis=0)
     starts[:, column] = np.clip(np.array(SHARES) * screened.start[column], *(b[column] for b in bench.bounds))
-    columns = padded([bench.columns_with((screened.candidate,))] * len(starts), most_unknowns(bench))
+    columns = padded([bench.columns_with((screened.candidate,))] * len(starts))
     return current, refit(bench, starts, columns, noise, race=False), column
 
 
@@ -95,7 +95,7 @@ def test_most_of_the_way_to_a_minimum_is_gone_at_a_longer_step(starved, monkeypa
     noise = plain_noise(np.array([1e-8]), starved.problem.samples.measured)
     start = starved.nominal[None].copy()
     start[0, starved.base_columns] += 0.02
-    columns = padded([starved.base_columns], most_unknowns(starved))
+    columns = padded([starved.base_columns])
     simulated, found, spent = Workbench.simulated, {}, Counter()
 
     def counted(bench, points, *others):

@@ -60,7 +60,7 @@ def test_the_frequency_of_what_is_there_is_among_those_that_are_tried(fit, effec
     noise = NOISE * np.random.default_rng(6).standard_normal(SAMPLES)
     bench = bench_of(fit, position(**{effect: sizes}) + noise)
     noise = plain_noise(bench.problem.noise_variance, bench.problem.samples.measured)
-    current = refit(bench, bench.nominal[None], padded([bench.base_columns], len(bench.base_columns)), noise)
+    current = refit(bench, bench.nominal[None], padded([bench.base_columns]), noise)
     tried = with_frequencies(bench, current, noise, waves_of(bench)).scales[effect]["frequencies"]
     resolution = 2.0 * np.pi / (SAMPLES * PERIOD)
     assert min(abs(frequency - sizes["frequency"]) for frequency in tried) < 0.5 * resolution

@@ -225,3 +225,14 @@ def test_readings_coarser_than_the_noise_are_quantised(deviations):
     found = diagnose(fit, record, key=jax.random.key(0))
     assert found.names == ("sensor_quantisation",), str(found)
     assert found.misfit.outputs["position"].lattice == pytest.approx(step, rel=1e-6)
+
+
+@of_the_oscillator
+@pytest.mark.thorough
+def test_three_effects_with_seven_numbers_are_found_together():
+    """No more than six were refitted at once: the third cause was then whatever had few enough."""
+    names = ("elastic_friction", "sensor_hum", "linear_damping")
+    found, _, said = diagnosed(Hidden("van_der_pol", "white", 1e-3, names, 1480975279), whole=True)
+    assert {"elastic_friction", "sensor_hum"} <= set(found.names), said
+    assert set(names) <= held(found), said
+    assert len(found.names) == 3, said

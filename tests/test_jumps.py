@@ -66,7 +66,7 @@ def test_a_reading_within_the_error_of_a_jump_carries_no_weight(before, beside):
     # Where the edge is, and not where chance has put the fit.
     point = bench.nominal.copy()
     point[bench.column["edge"]] = edge - 0.5
-    current = refit(bench, point[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
+    current = refit(bench, point[None], padded([bench.base_columns]), noise, iterations=1)
     left = without_jumps(bench, current, noise).problem.samples.measured
     dropped = bench.problem.samples.measured & ~left
     assert np.flatnonzero(dropped[0, :, 1]).tolist() == beside
@@ -102,7 +102,7 @@ def test_a_reading_just_behind_a_jump_that_the_steps_smear_carries_no_weight():
     point = bench.nominal.copy()
     truth = to_unit(bench.problem.coordinates, np.array([model.nominal.get(n, 0.0) for n in bench.problem.names]))
     point[bench.base_columns] = truth[bench.base_columns]
-    current = refit(bench, point[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
+    current = refit(bench, point[None], padded([bench.base_columns]), noise, iterations=1)
     dropped = bench.problem.samples.measured & ~without_jumps(bench, current, noise).problem.samples.measured
     assert behind in np.flatnonzero(dropped[0, :, 1]) and dropped[0, :, 1].sum() < 12
     assert not dropped[0, :, 0].any()

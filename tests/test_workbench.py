@@ -1,6 +1,7 @@
 """The trials' workbench: what it simulates side by side, against JAX's own derivatives."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,9 @@ from ehsvjax.diagnosis.bench.parts import parts_at
 from ehsvjax.diagnosis.bench.refits import not_made_up_for, padded, refit
 from ehsvjax.diagnosis.bench.setup import workbench
 from ehsvjax.diagnosis.bench.workbench import _simulated, prepared, settled
+from ehsvjax.diagnosis.decision import search
 from ehsvjax.diagnosis.decision.rivals import Rival, rivals_again
-from ehsvjax.diagnosis.decision.search import _from_nominal_starts_too, _look, _settled, _weighed
+from ehsvjax.diagnosis.decision.search import _best_of, _from_nominal_starts_too, _look, _settled, _weighed
 from ehsvjax.diagnosis.decision.stage import Stage
 from ehsvjax.diagnosis.decision.trials import refit_screened, refit_set, refit_sets, trials_of
 from ehsvjax.diagnosis.hypotheses.curves import bench_with, outputs_with, probe_at, quantities, straight_along
@@ -72,7 +74,7 @@ def test_derivatives_are_those_of_jax_at_effects_present_and_absent(bench):
     columns = bench.columns_with([present, absent])
     point = bench.nominal.copy()
     point[bench.columns_of(bench.candidates[present])] = 3.0
-    outputs, slopes = bench.linearised(point[None], padded([columns], len(columns) + 2))
+    outputs, slopes = bench.linearised(point[None], np.array([[*columns, -1, -1]]))
     with jax.enable_x64(True):
         problem = cast(bench.problem, jnp.float64)
         here = jnp.asarray(point)
@@ -172,7 +174,7 @@ def test_unknowns_beside_a_curve_make_up_for_what_they_can(bench):
     curve = straight_along(bench, "force", "position", quantities(bench), 9)
     # A stiffness that the plant has not: the unknowns lessen what it does, and cannot undo it.
     acting = bench_with(bench, curve, 20.0 * curve.knots)
-    start, columns = bench.nominal[None], padded([bench.base_columns], len(bench.base_columns))
+    start, columns = bench.nominal[None], padded([bench.base_columns])
     free, beside = (refit(b, start, columns, noise, race=False) for b in (bench, acting))
     at_once = noise.scaled(acting.problem.samples.outputs - acting.simulated(start)[0])
     assert free.cost[0] <= beside.cost[0] < float(at_once @ at_once)
@@ -204,7 +206,7 @@ def test_nothing_is_known_of_a_disturbance_that_lets_the_model_run_away(bench):
     assert np.isfinite(bench.sketched(at(middle)[None])).all()
     assert np.isfinite(parts_at(bench, at(middle), "force").responses).all()
     noise = plain_noise(np.array([1e-4]), bench.problem.samples.measured)
-    there = refit(bench, at(middle)[None], padded([bench.base_columns], len(bench.base_columns)), noise, iterations=1)
+    there = refit(bench, at(middle)[None], padded([bench.base_columns]), noise, iterations=1)
     found = process_noise(bench, there, noise)
     assert found is None or np.isfinite(found.likelihood)
 
@@ -311,6 +313,27 @@ def test_arithmetic_is_asked_for_what_is_left_along_it_and_for_no_less_than_the_
     assert steps(white + 30.0 * np.sqrt(noise.variances[0]) * (np.arange(SAMPLES) == 7)[:, None]) == steps(white)
     signs = np.repeat(rng.choice([-1.0, 1.0], 20), SAMPLES // 20)[:, None]
     assert steps(white + 1e3 * signs * off) == 1
+
+
+@pytest.mark.parametrize(("steep", "found"), [(True, False), (False, True)])
+def test_what_half_the_step_takes_away_is_no_gain(bench, monkeypatch, unchecked, steep, found):
+    """Friction steeper than the step explained how a random force had shaken a ball that nothing holds."""
+    coarse = replace(bench, problem=replace(bench.problem, substeps=np.int32(2)))
+    candidate = [c.name for c in bench.candidates].index("stribeck_friction")
+    force, velocity = bench.columns_of(bench.candidates[candidate])
+    point = bench.nominal.copy()
+    point[force], point[velocity] = bench.coordinate(0.5, force), bench.bounds[0 if steep else 1][velocity]
+    # The arithmetic of the step makes these readings: where it is steep, those of none that is shorter.
+    readings = coarse.simulated(point[None])[0] + 1e-4 * np.random.default_rng(2).standard_normal((1, SAMPLES, 1))
+    samples = bench.problem.samples._replace(outputs=readings)
+    trials = trials_of(replace(coarse, problem=replace(coarse.problem, samples=samples)), lambda *_: None)
+    noise = plain_noise(np.array([1e-8]), samples.measured)
+    current = refit_set(trials, bench.nominal, (), noise)
+    screened = Screened(candidate, 5.0, 1e-6, 1e-4, point, np.zeros(SAMPLES), (), False, 0.0)
+    assert refit_screened(trials, [screened], (), noise, current).cost[0] < 0.1 * current.cost[0]
+    monkeypatch.setattr(search, "_look", lambda *_: SimpleNamespace(leaves_something=False))
+    best = _best_of(Stage(trials, (), current, noise, Screening((screened,), (), 3.0)), [screened])
+    assert (best is not None) == found
 
 
 def test_what_unknowns_make_up_for_is_nothing_to_them(bench):

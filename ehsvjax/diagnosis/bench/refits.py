@@ -96,8 +96,9 @@ def noise_of_all_left(bench: Workbench, final: Refits) -> Noise:
     return noise_outside(final.residual[0], bench.problem.samples.measured, [final.slopes[0]])
 
 
-def padded(columns: list[list[int]], width: int) -> Int[np.ndarray, "individual direction"]:
-    """Return lists of columns side by side, filled up with -1."""
+def padded(columns: list[list[int]]) -> Int[np.ndarray, "individual direction"]:
+    """Return lists of columns side by side, filled up with -1 to the length of the longest; one at least."""
+    width = max(1, *map(len, columns))
     return np.array([list(c) + [-1] * (width - len(c)) for c in columns])
 
 

@@ -77,7 +77,7 @@ def predicted(
 
     """
     own = [bench.columns_with(some) for some in sets]
-    columns = padded(own, max(map(len, own)))
+    columns = padded(own)
     points, refitted = (np.concatenate(each) for each in zip(*[(r.points, r.residual) for r in refits], strict=True))
     squares = np.sum(noise.scaled(refitted) ** 2, axis=1)
     residual = np.full_like(refitted, np.nan)
@@ -115,5 +115,5 @@ def _left_out(
     of_record = [j for j, name in enumerate(bench.problem.names) if name.endswith(f"[{record}]")]
     initial = [j for j in of_record if j in bench.base_columns]
     points[:, of_record] = np.where(np.isin(of_record, initial), points[:, of_record], bench.nominal[of_record])
-    chosen = padded([initial] * len(points), max(len(initial), 1))
+    chosen = padded([initial] * len(points))
     return refit(bench, points, chosen, noise.of_record(record), race=False).residual

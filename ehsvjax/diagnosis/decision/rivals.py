@@ -15,7 +15,6 @@ from ehsvjax.diagnosis.decision.stage import Stage, all_but, with_instead
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
-    fits,
     refit_screened,
     refit_set,
     refit_sets,
@@ -73,10 +72,8 @@ def rivals_again(
     ranked = []
     for own, group in zip(stage.included, groups, strict=True):
         rest = all_but(stage.included, own)
-        # Beside what has been swapped in for another cause, some have too many numbers.
         others = [r for r in group if r.candidate not in stage.included]
-        able = [r for r in others if fits(stage.trials.bench, (*rest, r.candidate))]
-        ranked.append(_ranked(stage, own, {own: stage.current} | _refitted_beside(stage, able, rest)))
+        ranked.append(_ranked(stage, own, {own: stage.current} | _refitted_beside(stage, others, rest)))
     for own, group in zip(stage.included, ranked, strict=True):
         if group[0].candidate != own:
             stage = _swapped(stage, own, group[0])
@@ -180,7 +177,7 @@ def _beside(trials: Trials, start: Float[np.ndarray, " parameter"], current: Ref
     # The model's unknowns from where they are with the cause, and from where they are without it.
     starts = np.stack([start, start])
     starts[1, own] = current.points[0, own]
-    held = refit(bench, starts, padded([own] * 2, current.chosen.shape[1]), noise)
+    held = refit(bench, starts, padded([own] * 2), noise)
     return refit(bench, held.points[np.argmin(held.cost)][None], current.chosen, noise, iterations=1)
 
 
@@ -195,7 +192,7 @@ def _refitted_from(
     screening = screen(bench, base, responses_at(bench, base, rest, noise, trials.waves), noise, 1)
     # What all records share is no worse an explanation for what each could have for itself.
     able = [s for s in screening.ranked if bench.of_each(own) or not bench.of_each(s.candidate)]
-    close = [s for s in _close(able, own) if fits(bench, (*rest, s.candidate))]
+    close = _close(able, own)
     if not close:
         return {}
     refitted = refit_screened(trials, close, rest, noise, base, [with_it])

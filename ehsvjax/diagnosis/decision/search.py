@@ -20,7 +20,6 @@ from ehsvjax.diagnosis.decision.stage import Stage, all_but, with_instead
 from ehsvjax.diagnosis.decision.trials import (
     REFITTED_TOGETHER,
     Trials,
-    fits,
     refit_reshaped,
     refit_screened,
     refit_set,
@@ -315,19 +314,28 @@ def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise)
 
     Where another is far behind, its arithmetic counts as a part of that.
     """
-    readings = bench.problem.samples.outputs
     known = _settled(bench, compared[0].points, noise)
-    here = int(known.problem.substeps)
-    points = np.concatenate([refitted.points for refitted in compared])
-    coarse, fine = (readings - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here))
-    fine = coarse + np.stack(
-        [not_made_up_for(*each, noise.scaled) for each in zip(fine - coarse, compared, strict=True)]
-    )
-    before, after = (np.array([noise.gained(left, every[0]) for left in every]) for every in (coarse, fine))
+    every = _at_its_step_and_at_half(known, compared, noise)
+    before, after = (np.array([noise.gained(each, left[0]) for each in left]) for left in every)
     worth = float(np.max(np.abs(after - before) / np.maximum(1.0, np.abs(after) / _WEIGHED)))
     if known is bench and worth > 1.0 and not finest(known.problem):
-        return replace(known, problem=replace(known.problem, substeps=np.int32(2 * here))), worth
+        return replace(known, problem=replace(known.problem, substeps=2 * known.problem.substeps)), worth
     return known, worth
+
+
+def _at_its_step_and_at_half(
+    bench: Workbench, compared: Sequence[Refits], noise: Noise
+) -> tuple[Float[np.ndarray, "explanation record time signal"], Float[np.ndarray, "explanation record time signal"]]:
+    """Return what explanations leave, and what they would at half the step, once their unknowns have followed."""
+    points = np.concatenate([refitted.points for refitted in compared])
+    here = int(bench.problem.substeps)
+    coarse, fine = (
+        bench.problem.samples.outputs - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here)
+    )
+    for each, left, refitted in zip(fine, coarse, compared, strict=True):
+        if np.isfinite(change := each - left).all():
+            each[:] = left + not_made_up_for(change, refitted, noise.scaled)
+    return coarse, fine
 
 
 def _settled(bench: Workbench, point: Float[np.ndarray, "1 parameter"], noise: Noise) -> Workbench:
@@ -414,9 +422,7 @@ def _next_effect(stage: Stage) -> Stage | None:
     if len(stage.included) == _MOST_EFFECTS:
         return None
     bench = stage.trials.bench
-    hopeful = [
-        s for s in stage.screening.ranked if s.corrected < SIGNIFICANT and fits(bench, (*stage.included, s.candidate))
-    ]
+    hopeful = [s for s in stage.screening.ranked if s.corrected < SIGNIFICANT]
     shared = _best_of(stage, [s for s in hopeful if not bench.of_each(s.candidate)])
     own = _best_of(stage, [s for s in hopeful if bench.of_each(s.candidate)])
     if shared is None or own is None:
@@ -436,18 +442,21 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
         more = ", ..." if len(some) > 3 else ""
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
-        penalised = refitted.cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
+        # What half the step takes away was no gain: friction that is steeper than the step shakes what nothing holds.
+        _, left = _at_its_step_and_at_half(bench, [refitted.of([k]) for k in range(len(some))], stage.noise)
+        cost = np.sum(stage.noise.scaled(left) ** 2, axis=1)
+        penalised = cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
         enough = [
-            np.isfinite(cost)
+            np.isfinite(squares)
             and stage.noise.in_variances(
-                float(stage.current.cost[0] - cost), stage.current.residual[0], residual
+                float(stage.current.cost[0] - squares), stage.current.residual[0], residual
             )[0] > stage.required_gain(s.candidate)
-            for s, cost, residual in zip(some, refitted.cost, refitted.residual, strict=True)
+            for s, squares, residual in zip(some, cost, left, strict=True)
         ]  # fmt: skip
         if not any(enough):
             continue
         chosen = int(np.argmin(np.where(enough & np.isfinite(penalised), penalised, np.inf)))
-        if best is not None and not refitted.cost[chosen] < _cost_under(best.current, stage.noise):
+        if best is not None and not cost[chosen] < _cost_under(best.current, stage.noise):
             break
         candidate = some[chosen].candidate
         best = _look(trials, (*stage.included, candidate), refitted.of([chosen]), stage.noise)

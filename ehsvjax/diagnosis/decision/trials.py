@@ -18,8 +18,6 @@ from ehsvjax.effects.effect import UNLIMITED
 
 REFITTED_TOGETHER = 8
 """Candidates that are refitted in one race."""
-# Numbers of effects that can be refitted besides the model's unknowns.
-_OWN_NUMBERS = 6
 # Shares of a linear estimate of an effect from which it is refitted too.
 _SHARES = (2.0, 1.4, 0.7, 0.5, 0.35, 0.2, 0.1, 0.02)
 
@@ -60,16 +58,6 @@ def trials_of(begun: Workbench, progress: Progress) -> Trials:
     return Trials(bench, seen, terms, waves_of(bench), every, {}, progress)
 
 
-def most_unknowns(bench: Workbench) -> int:
-    """Return how many unknowns can be refitted at once."""
-    return len(bench.base_columns) + _OWN_NUMBERS
-
-
-def fits(bench: Workbench, included: Sequence[int]) -> bool:
-    """Whether these effects can be refitted together."""
-    return len(bench.columns_with(included)) <= most_unknowns(bench)
-
-
 def refit_sets(
     trials: Trials,
     starts: Sequence[Sequence[Float[np.ndarray, " parameter"]]],
@@ -88,7 +76,7 @@ def refit_sets(
         for some, s in zip(starts, sets, strict=True)
     ]
     of = np.repeat(np.arange(len(sets)), [len(choice) for choice in choices])
-    columns = padded([bench.columns_with(s) for s in sets], most_unknowns(bench))
+    columns = padded([bench.columns_with(s) for s in sets])
     led = refit(bench, np.concatenate([np.stack(choice) for choice in choices]), columns[of], noise, race=race)
     # Among its own: a set of which no start can be simulated is not to have another's refit.
     own = [np.flatnonzero(of == i) for i in range(len(sets))]
@@ -140,7 +128,7 @@ def refit_reshaped(trials: Trials, current: Refits, included: Sequence[int], can
         starts.append(start)
     if not starts:
         return current
-    columns = padded([bench.columns_with(included)] * len(starts), most_unknowns(bench))
+    columns = padded([bench.columns_with(included)] * len(starts))
     found = refit(bench, np.stack(starts), columns, noise)
     best = found.of([int(np.argmin(found.cost))])
     if not best.cost[0] < current.cost[0]:
@@ -218,7 +206,7 @@ def _grown(
             of.append(k)
     if not starts:
         return [[] for _ in some]
-    led = refit(bench, np.stack(starts), padded(columns, max(map(len, columns))), noise, race=False).points
+    led = refit(bench, np.stack(starts), padded(columns), noise, race=False).points
     return [[point for point, i in zip(led, of, strict=True) if i == k] for k in range(len(some))]
 
 

@@ -95,7 +95,7 @@ def as_fit(selection: Selection, refits: Refits, included: tuple[int, ...]) -> F
 def _unweighted(selection: Selection, refits: Refits, included: tuple[int, ...]) -> Refits:
     bench = selection.bench
     variances = np.array(list(_variances(selection, refits).values()))
-    columns = padded([bench.columns_with(included)], refits.chosen.shape[1])
+    columns = padded([bench.columns_with(included)])
     return refit(bench, refits.points, columns, plain_noise(variances, bench.problem.samples.measured))
 
 
