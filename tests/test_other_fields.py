@@ -35,6 +35,16 @@ def test_hills_of_a_road_are_no_periodic_force():
     assert answer(found, frozenset()) == "left open", str(found)
 
 
+@pytest.mark.thorough
+def test_what_takes_half_of_what_is_wrong_may_be_a_part_of_what_the_bank_lacks():
+    """A push that fades in fast motion: "sensor_cubic (certain)", and half of it left."""
+    rig = faults(np.random.default_rng(1755846791))[-1]
+    assert rig.hidden == "the push loses 20% in fast motion"
+    found = diagnosed(rig, 1755846791)
+    assert found.leaves_something and found.alternatives, str(found)
+    assert answer(found, rig.said_by) == "left open", str(found)
+
+
 def test_every_rig_and_fault_can_be_recorded():
     made = [rig(np.random.default_rng(3)) for rig in RIGS] + faults(np.random.default_rng(3))
     assert len({rig.hidden for rig in made}) == len(made)

@@ -63,20 +63,19 @@ def may_be_unknown(innocent: bool, chance: ProcessNoise | None) -> bool:
     return not innocent or (chance is not None and not chance.settled)
 
 
-def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
+def verdict_of(examined: Examination, predicted_by: Sequence[float]) -> Verdict:
     """Return the verdict, with the causes and what could be there instead.
 
     Args:
         examined: the causes, and what they leave.
-        predicted_by: of each cause, whether it helps to predict data that were not used.
+        predicted_by: of each cause, the share of what is left without it of data that were not used that it removes.
 
     """
     selection, bench = examined.selection, examined.selection.bench
     order = np.argsort([-need.gain for need in selection.needs]).tolist()
     groups = [_group(examined, k) for k in order]
     if may_be_unknown(examined.innocent, examined.chance):
-        # There, what predicts nothing may as well stand for what the bank lacks.
-        groups = [g if predicted_by[k] else _or_unknown(g) for k, g in zip(order, groups, strict=True)]
+        groups = [_or_unknown(g, predicted_by[k]) for k, g in zip(order, groups, strict=True)]
     if examined.lacking or not (examined.innocent or groups):
         return UNEXPLAINED
     others = [{name: 1.0} for name in _quantised(selection)]
@@ -94,8 +93,16 @@ def verdict_of(examined: Examination, predicted_by: Sequence[bool]) -> Verdict:
     return Verdict("ambiguous" if alternatives else "named", every, included, alternatives)
 
 
-def _or_unknown(group: Mapping[str, float]) -> dict[str, float]:
-    return {name: p / 2.0 for name, p in group.items()} | {UNKNOWN: 0.5}
+def _or_unknown(group: Mapping[str, float], predicted_by: float) -> dict[str, float]:
+    """Return a group with what the bank lacks as one of it, which may be what a cause is taken for.
+
+    As likely as the group where that predicts nothing, and less by what it leaves where it does: what explains half of
+    what was wrong may be a part of what all of it is.
+    """
+    left = 1.0 - predicted_by
+    if not left > np.exp(-0.5 * INSEPARABLE):
+        return dict(group)
+    return {name: p / (1.0 + left) for name, p in group.items()} | {UNKNOWN: left / (1.0 + left)}
 
 
 def _group(examined: Examination, k: int) -> dict[str, float]:

@@ -46,8 +46,9 @@ class Gain(NamedTuple):
         on: says on which data.
         left_open: for each, whether the others leave open how large the causes are: it is not predicted but fitted, by
             both models, with them.
-        predicted_by: of each cause, as they were found, whether some output is predicted better with all of them than
-            without it, and than without any, and not by chance.
+        predicted_by: of each cause, as they were found, the share of what can be removed of some output's error without
+            it that is gone with it; 0 where that may be chance, or no output is predicted better with all than without
+            any.
 
     """
 
@@ -56,7 +57,7 @@ class Gain(NamedTuple):
     records: tuple[str, ...]
     on: str
     left_open: tuple[bool, ...]
-    predicted_by: tuple[bool, ...]
+    predicted_by: tuple[float, ...]
 
     @property
     def worse(self) -> bool:
@@ -95,7 +96,9 @@ def gain_of(
     by_record = _gains(judged, rng)
     outputs = by_record[0] if len(judged) == 1 else _gains([_together(judged)], rng)[0]
     by_all = _better(outputs) and not all(left_open)
-    predicted_by = tuple(by_all and _predicted_by(selection, 1 + k, rng) for k in range(len(selection.included)))
+    predicted_by = tuple(
+        _predicted_by(selection, 1 + k, rng) if by_all else 0.0 for k in range(len(selection.included))
+    )
     return Gain(outputs, tuple(by_record), names, on, left_open, predicted_by)
 
 
@@ -104,10 +107,13 @@ def _better(outputs: Mapping[str, OutputGain]) -> bool:
     return any(gain.share_interval[0] > 0.0 for gain in outputs.values())
 
 
-def _predicted_by(selection: Selection, without: int, rng) -> bool:
-    """Whether unused data are predicted better with all causes than with one of the sets, and not by chance."""
+def _predicted_by(selection: Selection, without: int, rng) -> float:
+    """Return the share of what one of the sets leaves of unused data that is gone with all, if not by chance."""
     left_open, judged = _without(selection, without)
-    return not all(left_open) and _better(_gains([_together(judged)], rng)[0])
+    if all(left_open):
+        return 0.0
+    outputs = _gains([_together(judged)], rng)[0]
+    return max([min(gain.share_removed, 1.0) for gain in outputs.values() if gain.share_interval[0] > 0.0], default=0.0)
 
 
 def _without(selection: Selection, without: int) -> tuple[tuple[bool, ...], list[_Judged]]:
