@@ -47,6 +47,7 @@ benchmarks: $(VENV)/installed-benchmark
 	$(BIN)/python benchmarks/generations_per_second.py
 	$(BIN)/python benchmarks/against_c.py
 	$(BIN)/python benchmarks/equal_accuracy.py
+	$(BIN)/python benchmarks/several_processes.py
 	$(BIN)/python benchmarks/scaling.py
 	$(BIN)/python benchmarks/cold_start.py
 	$(BIN)/python benchmarks/damaged_files.py
