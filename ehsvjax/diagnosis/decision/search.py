@@ -315,27 +315,32 @@ def _settled_for_all(bench: Workbench, compared: Sequence[Refits], noise: Noise)
     Where another is far behind, its arithmetic counts as a part of that.
     """
     known = _settled(bench, compared[0].points, noise)
-    every = _at_its_step_and_at_half(known, compared, noise)
-    before, after = (np.array([noise.gained(each, left[0]) for each in left]) for left in every)
+    coarse = known.problem.samples.outputs - known.simulated(np.concatenate([r.points for r in compared]))
+    fine = _at_half_the_step(known, compared, coarse, noise)
+    before, after = (np.array([noise.gained(each, left[0]) for each in left]) for left in (coarse, fine))
     worth = float(np.max(np.abs(after - before) / np.maximum(1.0, np.abs(after) / _WEIGHED)))
     if known is bench and worth > 1.0 and not finest(known.problem):
         return replace(known, problem=replace(known.problem, substeps=2 * known.problem.substeps)), worth
     return known, worth
 
 
-def _at_its_step_and_at_half(
-    bench: Workbench, compared: Sequence[Refits], noise: Noise
-) -> tuple[Float[np.ndarray, "explanation record time signal"], Float[np.ndarray, "explanation record time signal"]]:
-    """Return what explanations leave, and what they would at half the step, once their unknowns have followed."""
+def _at_half_the_step(
+    bench: Workbench,
+    compared: Sequence[Refits],
+    coarse: Float[np.ndarray, "explanation record time signal"],
+    noise: Noise,
+) -> Float[np.ndarray, "explanation record time signal"]:
+    """Return what explanations would leave at half the step, once their unknowns have followed, from what they leave.
+
+    Of what could not be simulated or refitted, nothing that is finite.
+    """
     points = np.concatenate([refitted.points for refitted in compared])
-    here = int(bench.problem.substeps)
-    coarse, fine = (
-        bench.problem.samples.outputs - bench.simulated(points, substeps=substeps) for substeps in (here, 2 * here)
-    )
-    for each, left, refitted in zip(fine, coarse, compared, strict=True):
-        if np.isfinite(change := each - left).all():
-            each[:] = left + not_made_up_for(change, refitted, noise.scaled)
-    return coarse, fine
+    fine = bench.problem.samples.outputs - bench.simulated(points, substeps=2 * int(bench.problem.substeps))
+    change = fine - coarse
+    return coarse + np.stack([
+        not_made_up_for(each, refitted, noise.scaled) if np.isfinite(each).all() else each
+        for each, refitted in zip(change, compared, strict=True)
+    ])  # fmt: skip
 
 
 def _settled(bench: Workbench, point: Float[np.ndarray, "1 parameter"], noise: Noise) -> Workbench:
@@ -443,7 +448,7 @@ def _best_of(stage: Stage, hopeful: Sequence[Screened]) -> Stage | None:
         trials.progress(f"refitting the model with {names}{more}", 0.25 + 0.08 * len(stage.included))
         refitted = refit_screened(trials, some, stage.included, stage.noise, stage.current)
         # What half the step takes away was no gain: friction that is steeper than the step shakes what nothing holds.
-        _, left = _at_its_step_and_at_half(bench, [refitted.of([k]) for k in range(len(some))], stage.noise)
+        left = _at_half_the_step(bench, [refitted.of([k]) for k in range(len(some))], refitted.residual, stage.noise)
         cost = np.sum(stage.noise.scaled(left) ** 2, axis=1)
         penalised = cost + [price(bench, s.candidate, x) for s, x in zip(some, refitted.points, strict=True)]
         enough = [
