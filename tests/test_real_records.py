@@ -36,7 +36,7 @@ def test_a_tank_that_overflows_is_found_and_another_record_predicted():
     assert held == {"sensor_cubic"} and "1/(V)^2 or more" in str(found)
     # Of what the bank has; something is left of which it may be a part: the sensor ends, and the bank bends it.
     (group,) = [
-        {**dict(zip(a.causes, a.probabilities, strict=True))} for a in found.alternatives if found.names[0] in a.causes
+        dict(zip(a.causes, a.probabilities, strict=True)) for a in found.alternatives if found.names[0] in a.causes
     ]
     assert found.causes[0].probability > 0.95 * (1.0 - group[UNKNOWN])
 

@@ -62,7 +62,7 @@ class Gain(NamedTuple):
     @property
     def worse(self) -> bool:
         """Whether some output is predicted worse with the causes than without any, and none better but by chance."""
-        return not _better(self.outputs) and any(g.rmse_after > g.rmse_before for g in self.outputs.values())
+        return not _removed(self.outputs) and any(g.rmse_after > g.rmse_before for g in self.outputs.values())
 
 
 class _Judged(NamedTuple):
@@ -95,25 +95,22 @@ def gain_of(
             on = f"the last {HELD_BACK:.0%} of the record, which was held back"
     by_record = _gains(judged, rng)
     outputs = by_record[0] if len(judged) == 1 else _gains([_together(judged)], rng)[0]
-    by_all = _better(outputs) and not all(left_open)
+    by_all = _removed(outputs) > 0.0 and not all(left_open)
     predicted_by = tuple(
         _predicted_by(selection, 1 + k, rng) if by_all else 0.0 for k in range(len(selection.included))
     )
     return Gain(outputs, tuple(by_record), names, on, left_open, predicted_by)
 
 
-def _better(outputs: Mapping[str, OutputGain]) -> bool:
-    """Whether some output is predicted better, and not by chance."""
-    return any(gain.share_interval[0] > 0.0 for gain in outputs.values())
+def _removed(outputs: Mapping[str, OutputGain]) -> float:
+    """Return the largest share of what can be removed of an output's error that is gone, if not by chance; else 0."""
+    return max([min(gain.share_removed, 1.0) for gain in outputs.values() if gain.share_interval[0] > 0.0], default=0.0)
 
 
 def _predicted_by(selection: Selection, without: int, rng) -> float:
     """Return the share of what one of the sets leaves of unused data that is gone with all, if not by chance."""
     left_open, judged = _without(selection, without)
-    if all(left_open):
-        return 0.0
-    outputs = _gains([_together(judged)], rng)[0]
-    return max([min(gain.share_removed, 1.0) for gain in outputs.values() if gain.share_interval[0] > 0.0], default=0.0)
+    return 0.0 if all(left_open) else _removed(_gains([_together(judged)], rng)[0])
 
 
 def _without(selection: Selection, without: int) -> tuple[tuple[bool, ...], list[_Judged]]:
