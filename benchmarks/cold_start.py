@@ -106,11 +106,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
-    record = common.cases()["van_der_pol"].record
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder) / "record.npz"
-        np.savez(data, time=record.time, command=record.inputs["command"], position=record.outputs["position"])
+        data = common.oscillator_record(Path(folder))
         measured: dict[str, list[dict]] = {"without a cache": [], "cache, first": [], "cache, second": []}
         for repeat in range(options.repeats):
             cache = Path(folder) / f"cache_{repeat}"

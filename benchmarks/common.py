@@ -60,6 +60,13 @@ def cases(duration_factor: float = 1.0) -> dict[str, Case]:
     return found
 
 
+def oscillator_record(folder: Path) -> Path:
+    """Return a file with the paper's oscillator record, for processes of their own to read."""
+    record, file = cases()["van_der_pol"].record, folder / "record.npz"
+    np.savez(file, time=record.time, command=record.inputs["command"], position=record.outputs["position"])
+    return file
+
+
 def individuals(case: Case, count: int) -> jax.Array:
     """Return that many individuals in the inner half of the bounds, `[individual, parameter]`."""
     return 0.25 + 0.5 * jax.random.uniform(jax.random.key(count), (count, case.problem.unknowns))

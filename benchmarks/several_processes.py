@@ -18,7 +18,6 @@ import tempfile
 from pathlib import Path
 
 import common
-import numpy as np
 
 DEVICES = 4
 
@@ -46,13 +45,13 @@ print(json.dumps({"seconds": taken[1:], "bits": bits}))
 """
 
 
-def measured(data: Path, processes: int, devices: int, options: argparse.Namespace) -> list[dict]:
+def measured(data: Path, processes: int, devices: int, repeats: int, options: argparse.Namespace) -> list[dict]:
     """Return what each of some processes says, a core each, an island on each of their devices."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     cores = sorted(os.sched_getaffinity(0))
-    common_arguments = [processes * devices, devices, options.population, options.generations, options.repeats]
+    common_arguments = [processes * devices, devices, options.population, options.generations, repeats]
     running = []
     for index in range(processes):
         arguments = [data, cores[index % len(cores)], address, processes, index, *common_arguments]
@@ -77,14 +76,12 @@ def main() -> None:
     parser.add_argument("--generations", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
     options = parser.parse_args()
-    record = common.cases()["van_der_pol"].record
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        data = Path(folder) / "record.npz"
-        np.savez(data, time=record.time, command=record.inputs["command"], position=record.outputs["position"])
-        (together,) = measured(data, 1, 2 * DEVICES, options)
+        data = common.oscillator_record(Path(folder))
+        (together,) = measured(data, 1, 2 * DEVICES, 0, options)
         for processes in (1, 2):
-            said = measured(data, processes, DEVICES, options)
+            said = measured(data, processes, DEVICES, options.repeats, options)
             # They wait for each other: the slowest says how long it took.
             seconds = statistics.median(map(max, zip(*(each["seconds"] for each in said), strict=True)))
             islands = processes * DEVICES
